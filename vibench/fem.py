@@ -109,10 +109,12 @@ def unilateral(basis: Basis, sense: Sense, *, free: Indices | None = None, lumpe
     NumericalError
         If the integral of a function is not positive, as with quadratic elements.
     """
-    vertices = _vertices(basis)
+    mesh, is_on_facets = basis.mesh, isinstance(basis, FacetBasis)
+    table, chosen = (mesh.facets, basis.find) if is_on_facets else (mesh.t, basis.tind)
+    vertices = np.unique(table if chosen is None else table[:, chosen]).astype(np.intp)
     if free is not None:
         vertices = vertices[np.isin(basis.nodal_dofs[0, vertices], free)]
-    dofs, points = basis.nodal_dofs[0, vertices], basis.mesh.p[:, vertices]
+    dofs, points = basis.nodal_dofs[0, vertices], mesh.p[:, vertices]
     sign = 1.0 if sense == "<=" else -1.0
     W, integrals = _multipliers(basis, dofs, lumped)
     places, shape = (np.arange(len(dofs)), dofs), (len(dofs), basis.N)
@@ -194,13 +196,6 @@ def _integrals(basis: Basis, dofs: Indices, values: Callable[[Array], Array]) ->
 
 def _is_vector(basis: Basis) -> bool:
     return isinstance(basis.elem, ElementVector)
-
-
-def _vertices(basis: Basis) -> Indices:
-    """Vertices of the elements or facets of a basis, rising."""
-    mesh, chosen = basis.mesh, basis.find if isinstance(basis, FacetBasis) else basis.tind
-    table = mesh.facets if isinstance(basis, FacetBasis) else mesh.t
-    return np.unique(table if chosen is None else table[:, chosen]).astype(np.intp)
 
 
 def _multipliers(basis: Basis, dofs: Indices, lumped: bool) -> tuple[InnerProduct, Integrals | None]:

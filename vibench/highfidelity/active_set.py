@@ -247,9 +247,8 @@ def verified(
         fallback = "; ".join(filter(None, (unverified.fallback, "solved without condensation")))
         solution = _refined_to_accuracy(vi, plain, replace(again, fallback=fallback))
     if not solution.residuals.worst <= ACCURACY:
-        raise NumericalError(
-            f"the high-fidelity solution has the natural residual {solution.residuals.worst:.1e}, above {ACCURACY:.0e}"
-        )
+        left = f"{solution.residuals.worst:.1e}, above {ACCURACY:.0e}"
+        raise NumericalError(f"the high-fidelity solution has the natural residual {left}")
     return solution
 
 

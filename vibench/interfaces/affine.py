@@ -308,10 +308,9 @@ def _with_absent_rows(terms: tuple[Array, ...], thetas: Callable[[Array], Any]) 
         # A coefficient that changes its sign would make a bound of −∞ of one of +∞.
         if theta is None or not theta > 0.0:
             row = int(np.argmax(infinite[q]))
-            raise NumericalError(
-                f"row {row} of term {q} is infinite, and its coefficient is no positive constant: give the infinite "
-                "entries a term of their own, with the coefficient 1"
-            )
+            remedy = "give the infinite entries a term of their own, with the coefficient 1"
+            fault = f"row {row} of term {q} is infinite, and its coefficient is no positive constant"
+            raise NumericalError(f"{fault}: {remedy}")
         made[q][infinite[q] & left] = ABSENT / theta
         left &= ~infinite[q]
     return tuple(made)

@@ -55,10 +55,8 @@ class Output:
             outputs = np.zeros(len(mus))
             for name, weights, columns in (("u", self.u, u), ("λ", self.lam, lam)):
                 if weights is not None and np.shape(weights) != (len(columns),):
-                    expected = f"expected ({len(columns)},)"
-                    raise NumericalError(
-                        f"the output '{self.name}' has coefficients of {name} of shape {np.shape(weights)}; {expected}"
-                    )
+                    found = f"shape {np.shape(weights)}; expected ({len(columns)},)"
+                    raise NumericalError(f"the output '{self.name}' has coefficients of {name} of {found}")
                 outputs += 0.0 if weights is None else weights @ columns
         else:
             outputs = np.array([self._value(mus[k], u[:, k], lam[:, k]) for k in range(len(mus))])
@@ -151,10 +149,8 @@ class MeshFields:
         elif corners.size and (corners.min() < 0 or corners.max() >= len(self.points)):
             yield f"{where} refers to nodes {corners.min()} to {corners.max()}; there are {len(self.points)}"
         elif count := np.count_nonzero(self._inverted(name, corners)):
-            yield (
-                f"{where}: {count} of {len(corners)} cells are inside out or flat; expected nodes in the order of VTK, "
-                "at every corner with edges that are right-handed"
-            )
+            right = "expected nodes in the order of VTK, at every corner with edges that are right-handed"
+            yield f"{where}: {count} of {len(corners)} cells are inside out or flat; {right}"
 
     def _inverted(self, name: str, corners: Indices) -> Any:
         """Mask of the cells (k,) of a type with a corner whose edges are not right-handed."""

@@ -272,10 +272,8 @@ def check_sample(box: ParameterBox, returned: object) -> Array:
         # Round-off of decimals and of scaled parameters, relative to the widths of the box.
         away = np.abs(listed[:, None] - mus) / box.widths
         for k in np.flatnonzero(away.max(axis=2).min(axis=0, initial=np.inf) > 1e-9)[:1]:
-            raise RequestError(
-                f"parameter {k} = {mus[k].tolist()} is not available: the problem has matrices only at its "
-                f"{len(listed)} listed parameters; choose among those"
-            )
+            there = f"the problem has matrices only at its {len(listed)} listed parameters; choose among those"
+            raise RequestError(f"parameter {k} = {mus[k].tolist()} is not available: {there}")
     # A parameter that occurs twice would count twice in means, and its snapshot in the POD.
     first = np.unique(mus, axis=0, return_index=True)[1]
     for k in sorted(set(range(len(mus))) - set(first.tolist()))[:1]:

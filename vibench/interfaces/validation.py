@@ -65,10 +65,9 @@ def check_enrichment(
         if np.max(np.abs(off), initial=0.0) > 1e-8:
             i, j = (int(k) for k in np.unravel_index(np.abs(off).argmax(), off.shape))
             other = f"mode {i} of V_N" if i < basis.shape[1] else f"vector {i - basis.shape[1]}"
-            raise NumericalError(
-                "the vectors of the enrichment are not orthonormal in V and orthogonal to V_N: "
-                f"the inner product of vector {j} with {other} is off by {off[i, j]:.1e}"
-            )
+            worst = f"the inner product of vector {j} with {other} is off by {off[i, j]:.1e}"
+            fault = "the vectors of the enrichment are not orthonormal in V and orthogonal to V_N"
+            raise NumericalError(f"{fault}: {worst}")
     return replace(enrichment, vectors=vectors, eta=eta, fallbacks=tuple(map(str, enrichment.fallbacks)))
 
 

@@ -237,10 +237,8 @@ def why_indefinite(matrix: SparseMatrix) -> str:
         direction /= np.max(np.abs(direction))
     constant = np.ptp(direction) <= 1e-6
     motion = "constants are" if constant else f"a motion that is largest at unknown {np.argmax(np.abs(direction))} is"
-    return (
-        f"it is singular, {motion} in its kernel: Dirichlet conditions were not applied, or contact alone holds a "
-        "body, which is not covered; prescribe such motions, or add a weak foundation"
-    )
+    why = "Dirichlet conditions were not applied, or contact alone holds a body, which is not covered"
+    return f"it is singular, {motion} in its kernel: {why}; prescribe such motions, or add a weak foundation"
 
 
 def svd(a: Array) -> tuple[Array, Array, Array]:

@@ -73,7 +73,10 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
     check_affine(problem, training)
     varying = [name for name in MEMBERS if name not in problem.constant and name not in problem.affine]
     assembled = assembled_members(problem, training, varying) if varying else {}
-    vanishing = _vanishing_row(assembled.get("B", ()))
+    vanish, vanishing = [zero_rows(B) for B in assembled.get("B", ())], ""
+    # What interpolation leaves of a row of B that vanishes at some parameters would be a constraint of its error.
+    if (sometimes := np.any([rows ^ vanish[0] for rows in vanish], axis=0)).any():
+        vanishing = f"row {int(np.argmax(sometimes))} of B is zero at some parameters and not at others"
     members: dict[str, AffineMember] = {}
     for name in MEMBERS:
         if name in problem.constant:
@@ -171,7 +174,10 @@ def decomposed(
         return _exact(reason, contact)
     entries = _Entries(values, symmetric=name == "A")
     weights = entries.weights(name, _units(V))
-    if entries.is_constant(weights):
+    spread = float(np.max(weights * np.ptp(entries.values, axis=1), initial=0.0))
+    largest = float(np.max(weights * np.abs(entries.values).max(axis=1, initial=0.0), initial=0.0))
+    # one parameter cannot show what varies; otherwise constants are those up to the round-off of the largest entry
+    if len(values) > 1 and spread <= 1e-13 * largest:
         return AffineMember(Evaluation.CONSTANT, (values[0],))
     reason = f"{name} depends on mu and the problem does not evaluate it entry by entry"
     if entrywise and len(values) > 1:
@@ -185,15 +191,6 @@ def decomposed(
             return AffineMember(Evaluation.INTERPOLATED, terms, rows, columns, interpolation.error)
         reason = f"{name} depends on mu, and interpolation needs {len(points)} terms for {len(values)} parameters"
     return _exact(reason, contact and name in ("B", "g"))
-
-
-def _vanishing_row(values: Sequence[SparseMatrix]) -> str:
-    """Why B and g are not interpolated: a row of B vanishes at some parameters alone; "" if none does."""
-    vanish = [zero_rows(B) for B in values]
-    if not (sometimes := np.any([rows ^ vanish[0] for rows in vanish], axis=0)).any():
-        return ""
-    # What interpolation leaves of such a row would be a constraint made of its error.
-    return f"row {int(np.argmax(sometimes))} of B is zero at some parameters and not at others"
 
 
 def _exact(reason: str, contact: bool) -> AffineMember:
@@ -262,13 +259,6 @@ class _Entries:
             np.maximum.at(largest, self.rows, weights * np.abs(self.values).max(axis=1, initial=0.0))
             weights /= np.where(largest > 0.0, largest, 1.0)[self.rows]
         return weights
-
-    def is_constant(self, weights: Array) -> bool:
-        """Tell whether no entry varies by more than the round-off of the largest one, with weights (k,)."""
-        spread = weights * np.ptp(self.values, axis=1)
-        largest = float((weights * np.abs(self.values).max(axis=1, initial=0.0)).max(initial=0.0))
-        # one parameter cannot show what varies
-        return self.values.shape[1] > 1 and float(spread.max(initial=0.0)) <= 1e-13 * largest
 
     def _of_matrices(self, matrices: Sequence[SparseMatrix]) -> Array:
         rows = [sp.csr_array(sp.triu(matrix) if self._symmetric else matrix) for matrix in matrices]

@@ -266,7 +266,6 @@ class _Factor:
         self._factor = scipy.linalg.cho_factor(compliance * self._unit * self._unit[:, None], overwrite_a=True)
 
     def solve(self, prescribed: Array) -> Array:
-        """Forces (k,) that displace the rows by prescribed values (k,)."""
         forces = self._solve_once(prescribed)
         # one step of refinement: rows that are nearly parallel lose half of the digits in the factor
         return forces + self._solve_once(prescribed - self._compliance @ forces)

@@ -277,10 +277,8 @@ def reference_bound(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam
     # 2κ is at most twice λᵀ times the first margin and the round-off itself, where w was found at once
     open_by_round_off = np.sqrt(4.0 * float(lam @ first_margin(round_off)))
     if not bound <= max(REFERENCE * size, open_by_round_off):
-        raise NumericalError(
-            f"the error bound of the high-fidelity solution is {ratio(bound, size):.1e} of it in the energy norm, "
-            f"above {REFERENCE:.0e}"
-        )
+        what = f"the error bound of the high-fidelity solution is {ratio(bound, size):.1e} of it in the energy norm"
+        raise NumericalError(f"{what}, above {REFERENCE:.0e}")
     return ratio(bound, size)
 
 

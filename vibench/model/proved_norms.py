@@ -50,7 +50,6 @@ class ProvedNorms:
         return ProvedNorms(self.A, precise=True)
 
     def _gamma(self, terms: int) -> float:
-        """The bound γ of round-off in a sum of so many terms."""
         return terms * self.unit / (1.0 - terms * self.unit)
 
     def energies(self, vectors: Array, products: Array) -> tuple[Array, Array]:

@@ -110,7 +110,7 @@ class Assemblies:
             return energy_inf_sup(vi.A, vi.B, W)
         if stiffness.has_known_round_off:
             known = self._contact_at(mu)
-            if known.has_inverse:
+            if known.inverse is not None:
                 return known.of_inverse(on.B, on.compliance, W)
             return known.energy_inf_sup(on.B, on.liftings, W)
         # Without a known round-off of the condensation A itself is used, where nothing is lost.

@@ -59,12 +59,10 @@ class CompiledModel:
     def source(self) -> str:
         """The C source; its function is called `model_solve`."""
         about: Mapping[str, Any] = {
-            "parameters": {"names": self.names, "units": self.units},
-            "cell": dict.fromkeys(("problem", "dual", "primal", "cell"), "of this run"),
+            "parameters": {"names": self.names, "units": self.units}, "exported_by": "vibench",
+            "cell": dict.fromkeys(("problem", "dual", "primal", "cell"), "of this run"), "accuracy": self.accuracy,
             "source": dict.fromkeys(("distribution", "licence"), "as the problem"),
-            "exported_by": "vibench",
-            "accuracy": self.accuracy,
-        }
+        }  # fmt: skip
         return c_source.source(self.members, {"lower": self.lower, "upper": self.upper}, about, "model")[0]
 
     def program(self) -> CompiledProgram:
@@ -118,7 +116,6 @@ def compiler() -> list[str]:
 
 
 def _compiled(source: str, folder: Path) -> Path:
-    """The shared library of a source, made in a folder."""
     command, library = compiler(), folder / "model.so"
     (folder / "model.c").write_text(source, encoding="utf-8")
     # No option may reorder sums: bounds of round-off are for this order.

@@ -19,15 +19,8 @@ import numpy as np
 from vibench.arrays import Array, is_count, is_sound, read_only, taken
 from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
-from vibench.interfaces.formulations import (
-    Formulation,
-    FormulationAnswer,
-    FormulationModel,
-    Multiplier,
-    OfflinePhase,
-    Outcome,
-    QuerySettings,
-)
+from vibench.interfaces import formulations
+from vibench.interfaces.formulations import Formulation, FormulationAnswer, FormulationModel, QuerySettings
 from vibench.interfaces.parameters import ParameterBox, outside
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind
@@ -133,7 +126,7 @@ class Model:
     """
 
     formulation: Formulation
-    offline: OfflinePhase = field(repr=False)
+    offline: formulations.OfflinePhase = field(repr=False)
     built: Mapping[str, Any] = field(repr=False)
     solver: str | None
     accuracy: float
@@ -255,7 +248,7 @@ class Model:
         if not isinstance(made, tuple) or len(made) != 2:
             raise NumericalError(f"`reconstruct` returned a {type(made).__name__}, expected a pair (u, λ)")
         u, lam = made
-        if (lam is None) != (declared is Multiplier.RESIDUAL):
+        if (lam is None) != (declared is formulations.Multiplier.RESIDUAL):
             which = "no λ" if lam is None else "a λ"
             raise NumericalError(f"`reconstruct` returned {which}, and the formulation declares `{declared.value}`")
         u = taken(u, "u of `reconstruct`", problem.V.dim, finite=False)
@@ -342,7 +335,6 @@ class Model:
         return _Settings(name, self.accuracy if accuracy is None else accuracy, tolerance, mode, of)
 
     def _answered(self, at: Array, settings: _Settings) -> Solution:
-        """The answer of the formulation itself."""
         model, online = self.solving(settings.solver, settings.accuracy), self.online
         query, solver = model.settings()
         answer, seconds = model.answered(at, query)
@@ -357,7 +349,6 @@ class Model:
         return Solution(at, *coefficients, 0.0, spent.cpu, self, lambda: judged.pair, None, None, *own)
 
     def _solution(self, at: Array, assembled: ReducedProblem, assembly: float, settings: _Settings) -> Solution:
-        """The verified solution of a program that took some seconds to assemble, by the QP solver."""
         assert settings.solver is not None  # `solves_programs`
         extra = registry.qp_solver(settings.solver)
         solve = partial(solve_qp, assembled.program, settings.solver, settings.accuracy, extra, assembled.factor)
@@ -367,7 +358,6 @@ class Model:
     def _program_solution(
         self, at: Array, assembled: ReducedProblem, found: QPSolution, seconds: tuple[float, float], settings: _Settings
     ) -> Solution:
-        """The verified answer to a program, with its bounds."""
         status, reason, residuals = verify(assembled.program, found, settings.accuracy)
         bound = correction = None
         x, alpha = found.x, found.alpha
@@ -513,7 +503,7 @@ def _taken(answer: object, model: FormulationModel) -> FormulationAnswer:
             raise NumericalError(f"{name} of the answer has {len(value)} coefficients, the model declares {most}")
     steps, estimate = answer.iterations, 0.0 if answer.uncertainty is None else answer.uncertainty
     for name, fine, right in (
-        ("outcome", isinstance(answer.outcome, Outcome), "a vibench.Outcome"),
+        ("outcome", isinstance(answer.outcome, formulations.Outcome), "a vibench.Outcome"),
         ("reason", isinstance(answer.reason, str), "a text"),
         ("iterations", steps is None or is_count(steps), "a whole number"),
         ("uncertainty", isinstance(estimate, Real) and 0.0 <= float(estimate) < inf, "a number of at least 0"),

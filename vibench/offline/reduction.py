@@ -12,21 +12,10 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError, RequestError, UnsupportedError, message_of, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces import validation
+from vibench.interfaces import strategies, validation
 from vibench.interfaces.formulations import Formulation, Snapshots, axes_of
 from vibench.interfaces.problem import Problem
-from vibench.interfaces.strategies import (
-    AdaptiveSampling,
-    Cone,
-    DualStrategy,
-    Enrichment,
-    Kind,
-    Offline,
-    PrimalStrategy,
-    Sampling,
-    Stop,
-    no_free,
-)
+from vibench.interfaces.strategies import AdaptiveSampling, Cone, DualStrategy, PrimalStrategy, Sampling, Stop
 from vibench.interfaces.validation import ReferenceAssembly, checked_assembly
 from vibench.linalg.inner_product import check_symmetric
 from vibench.model import hyperreduced
@@ -197,7 +186,7 @@ class Reduction:
         """The reduced cone K_R (paper, (12))."""
         W = self.problem.W
         if self.dual is None or self.generators is None:
-            return Cone(np.zeros((W.dim, 0)), np.ones(1), no_free(0))
+            return Cone(np.zeros((W.dim, 0)), np.ones(1), strategies.no_free(0))
         return validation.check_cone(self.dual.reduce(self.snapshots.lam, W, self.generators), W)
 
     @cached_property
@@ -206,15 +195,15 @@ class Reduction:
         return cone_basis(self.cone.generators, self.problem.W, self.cone.free)
 
     @cached_property
-    def offline(self) -> Offline:
+    def offline(self) -> strategies.Offline:
         """The input of the primal strategy."""
-        return Offline(self.problem, self.pod.basis, self.cone, self.multipliers.span, self.parameters)
+        return strategies.Offline(self.problem, self.pod.basis, self.cone, self.multipliers.span, self.parameters)
 
     @cached_property
-    def enrichment(self) -> Enrichment:
+    def enrichment(self) -> strategies.Enrichment:
         """The vectors that the primal strategy adds to V_N."""
         if self.primal is None:
-            return Enrichment(Kind.NONE)
+            return strategies.Enrichment(strategies.Kind.NONE)
         built = self.primal.build(self.offline, self.tolerance)
         return validation.check_enrichment(built, self.problem.V, self.pod.basis)
 

@@ -43,12 +43,10 @@ def _least_squares(theta: Array, generators: Array, support: Mask, W: InnerProdu
     """Coefficients α ≥ 0 (r,) that minimise ‖θ − Σ α_i ν_i‖_W with Σ α_i ν_i ≤ θ, and a note where they are inexact."""
     whitened, target = W.whiten(generators), W.whiten(theta)
     count, units = generators.shape[1], np.sqrt(W.matrix.diagonal())[support]
-    program = VariationalInequality(
-        A=whitened.T @ whitened,
-        f=whitened.T @ target,
-        B=np.vstack([-np.eye(count), units[:, None] * generators[support]]),
-        g=np.concatenate([np.zeros(count), units * theta[support]]),
-    )
+    A, f = whitened.T @ whitened, whitened.T @ target
+    B = np.vstack([-np.eye(count), units[:, None] * generators[support]])
+    g = np.concatenate([np.zeros(count), units * theta[support]])
+    program = VariationalInequality(A, f, B, g)
     best, smallest = np.zeros(count), np.inf
     for solver in ("piqp", "proxqp"):
         solution = solve_qp(program, solver, 1e-12)
@@ -56,21 +54,17 @@ def _least_squares(theta: Array, generators: Array, support: Mask, W: InnerProdu
             continue
         if not np.all(np.isfinite(np.append(solution.x, solution.alpha))):
             continue
-        residual = _largest_residual(program, solution.x, solution.alpha)
+        # Residuals are compared with their terms: A may be singular, and has no natural residuals.
+        force, excess = B.T @ solution.alpha, B @ solution.x - g
+        energies = float(solution.x @ A @ solution.x), abs(float(f @ solution.x))
+        residual = max(
+            ratio(float(np.max(excess, initial=0.0)), max(peak(g), peak(B @ solution.x))),
+            ratio(peak(A @ solution.x - f + force), max(peak(f), peak(force))),
+            ratio(abs(float(solution.alpha @ excess)), max(energies)),
+        )
         if residual < smallest:
             best, smallest = np.maximum(solution.x, 0.0), residual
         # A larger residual is recorded as a fallback; Remark 4.1 holds for any feasible solution.
         if smallest <= 1e-9:
             return best, ""
     return best, f"line 9 solved only to {smallest:.0e}, made feasible"
-
-
-def _largest_residual(program: VariationalInequality, x: Array, alpha: Array) -> float:
-    """Largest entry of the KKT residuals over those of their terms; A may be singular, and has no natural residuals."""
-    A, f, B, g = program.A, program.f, program.B, program.g
-    force, excess, energy = B.T @ alpha, B @ x - g, float(x @ A @ x)
-    return max(
-        ratio(float(np.max(excess, initial=0.0)), max(peak(g), peak(B @ x))),
-        ratio(peak(A @ x - f + force), max(peak(f), peak(force))),
-        ratio(abs(float(alpha @ excess)), max(energy, abs(float(f @ x)))),
-    )

@@ -176,32 +176,18 @@ def page(path: Path, *, figures: bool = True) -> str:
     style, script = ((templates / f"report.{end}").read_text(encoding="utf-8").strip() for end in ("css", "js"))
     template = environment("templates", trim_blocks=True, lstrip_blocks=True).get_template("report.html.j2")
     return template.render(
-        study=run.identity["study"] or path.parent.name,
-        facts=list(run.facts),
-        verdicts=run.verdicts,
-        standings=leaderboard(cells, paired),
-        criteria=Criterion,
-        largest_band=LARGEST_BAND,
-        way=way,
-        vanishes=VANISHES,
-        short=lambda cell: str(cell)[:key_length],
-        findings=list(findings.all_findings(read)),
-        cells=len(cells),
-        failed=int((cells["status"] != Status.OK).sum()),
+        study=run.identity["study"] or path.parent.name, facts=list(run.facts), verdicts=run.verdicts,
+        standings=leaderboard(cells, paired), criteria=Criterion, largest_band=LARGEST_BAND, way=way,
+        vanishes=VANISHES, short=lambda cell: str(cell)[:key_length], findings=list(findings.all_findings(read)),
+        cells=len(cells), failed=int((cells["status"] != Status.OK).sum()),
         missing=failures + [f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason],
-        grids=grids,
-        drawn=figures,
-        images=images,
-        cut=any(len(data.duals) > 1 for data in data_of.values()),
-        plots={plot.name: plot for plot in live},
-        overviews=first_plots,
+        grids=grids, drawn=figures, images=images, cut=any(len(data.duals) > 1 for data in data_of.values()),
+        plots={plot.name: plot for plot in live}, overviews=first_plots,
         plots_alone=[plot for plot in live if plot.name not in {image.name for image in images}],
         table_data=Markup(script_safe({grid.name: _columnar(grid) for grid in grids})),
         plot_data=Markup(script_safe({plot.name: plot.data for plot in (*first_plots, *live)})),
-        library=Markup(plots.library()) if live or first_plots else "",
-        style=Markup(style),
-        script=Markup(script),
-    )
+        library=Markup(plots.library()) if live or first_plots else "", style=Markup(style), script=Markup(script),
+    )  # fmt: skip
 
 
 @cache

@@ -141,10 +141,8 @@ class PublishedRun:
     @cached_property
     def values(self) -> dict[str, list[str]]:
         """Values by which the list of runs is filtered."""
-        axes = {
-            axis: sorted({str(row[axis]) for row in self.run.cells.values()})
-            for axis in ("problem", "dual", "primal", "solver")
-        }
+        names = ("problem", "dual", "primal", "solver")
+        axes = {axis: sorted({str(row[axis]) for row in self.run.cells.values()}) for axis in names}
         versions = self.run.versions.get("vibench", "")
         study = str(self.run.identity["study"])
         return {"study": [study], **axes, "machine": self.run.machines, "vibench": versions.split(", ")}

@@ -131,10 +131,8 @@ def _infsup_constants(prefix: str, pair: str) -> dict[str, Column]:
 
 
 def _effectivities(*names: str) -> dict[str, Column]:
-    meaning = (
-        "divided by the absolute error; empty where the relative error in V or W, or the scaled one if there is none, "
-        "is at most 1e-8."
-    )
+    small = "the relative error in V or W, or the scaled one if there is none, is at most 1e-8"
+    meaning = f"divided by the absolute error; empty where {small}."
     return {f"effectivity_{name}": real("1", f"bound_{name} {meaning}{_of_sum(name)}") for name in names}
 
 

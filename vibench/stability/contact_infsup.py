@@ -69,7 +69,7 @@ class ContactInfSup:
         extend: Callable[[Array], Array] = np.asarray, inverse: Array | None = None,
     ) -> None:  # fmt: skip
         self._schur, self._scale, self._lost, self._extend = schur, np.sqrt(squares), lost, extend
-        self._inverse = inverse
+        self.inverse = inverse
         # The largest row sum of S⁻¹|Ŝ|S⁻¹ bounds its norm; inner products with Ŝ have so many terms.
         parts = schur.blocks if isinstance(schur, BlockDiagonal) else ((np.arange(len(squares)), schur),)
         sums = [np.max((abs(part) @ (1.0 / self._scale[c])) / self._scale[c], initial=0.0) for c, part in parts]
@@ -79,11 +79,6 @@ class ContactInfSup:
     def energy_inf_sup(self, B: SparseMatrix, liftings: Array, W: InnerProduct) -> Constant:
         """Lower bound of β_A for B (m×c), from liftings (m×·) that `extend` makes Dᵀ; 0 where no other is proved."""
         return self._proved(B, W, lambda: self._products(sp.csr_array(B), liftings))
-
-    @property
-    def has_inverse(self) -> bool:
-        """Whether `of_inverse` can be used."""
-        return self._inverse is not None
 
     def of_inverse(self, B: SparseMatrix, compliance: Array, W: InnerProduct) -> Constant:
         """Lower bound of β_A from the compliance (m×m) that is computed as B(BĈ)ᵀ, the products row by row."""
@@ -98,8 +93,8 @@ class ContactInfSup:
     @cached_property
     def _of_inverse(self) -> tuple[Array, Array]:
         """The norms (c,) of the columns of SĈ and of S⁻¹E."""
-        assert self._inverse is not None
-        return self._products(sp.eye_array(len(self._inverse), format="csr"), self._inverse)[1:]
+        assert self.inverse is not None
+        return self._products(sp.eye_array(len(self.inverse), format="csr"), self.inverse)[1:]
 
     def _proved(self, B: SparseMatrix, W: InnerProduct, products: Callable[[], Products]) -> Constant:
         if not B.shape[0]:

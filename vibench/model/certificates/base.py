@@ -191,17 +191,13 @@ def unsupported(problem: Problem, members: Mapping[str, AffineMember]) -> str:
     count = len(contact_unknowns(problem))
     # 4 GiB: the inverse is one such array, its factor another
     if 8 * count**2 > 2**32:
-        return (
-            f"the constraint touches {count} unknowns, and certificates need their compliance, a dense matrix of "
-            f"{8e-9 * count**2:.0f} GB; the limit is 4.3 GB, {isqrt(2**29)} unknowns"
-        )
+        needed = f"a dense matrix of {8e-9 * count**2:.0f} GB; the limit is 4.3 GB, {isqrt(2**29)} unknowns"
+        return f"the constraint touches {count} unknowns, and certificates need their compliance, {needed}"
     if reason := "; ".join(members[name].reason for name in ("A", "f") if members[name].way is Evaluation.FULL):
         return reason
     if problem.parameters.listed is not None and not all(is_exact(problem, name, members[name]) for name in "Af"):
-        return (
-            "A or f is interpolated, and the problem has matrices at its listed parameters only: interpolation errors "
-            "are measured at others"
-        )
+        why = "the problem has matrices at its listed parameters only: interpolation errors are measured at others"
+        return f"A or f is interpolated, and {why}"
     return ""
 
 

@@ -24,12 +24,8 @@ from cachetools import LRUCache
 
 from vibench.arrays import Array, Mask, SparseMatrix
 from vibench.errors import at_parameter
-from vibench.highfidelity.active_set import (
-    ActiveSetSolution,
-    HighFidelitySolution,
-    HighFidelitySolver,
-    solve_unverified,
-)
+from vibench.highfidelity import active_set
+from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Trainer
@@ -328,10 +324,10 @@ class GreedyTrainer(Trainer):
         mu = np.array(mu, float)
         state = self._model.state(mu)
 
-        def work() -> tuple[VariationalInequality, ActiveSetSolution]:
+        def work() -> tuple[VariationalInequality, active_set.ActiveSetSolution]:
             if state is not None:
                 with at_parameter(mu):
-                    return state.vi, solve_unverified(state.vi, state.stiffness, state.pressed)
+                    return state.vi, active_set.solve_unverified(state.vi, state.stiffness, state.pressed)
             vi = checked_assembly(self._problem, mu)
             return vi, self._solver.solve_assembled(mu, vi)
 

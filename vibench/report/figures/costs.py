@@ -10,17 +10,9 @@ from matplotlib.axes import Axes
 
 from vibench.qp.status import Status
 from vibench.report.figures import data as tables
+from vibench.report.figures import style
 from vibench.report.figures.data import ProblemTables, label, parts, series, titled_parts, whole
-from vibench.report.figures.style import (
-    HIGH_FIDELITY_LOOK,
-    CaptionedFigure,
-    Layout,
-    Looks,
-    Series,
-    Sheet,
-    plot,
-    scatter,
-)
+from vibench.report.figures.style import CaptionedFigure, Layout, Looks, Series, Sheet, plot, scatter
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
 
 
@@ -107,7 +99,7 @@ def total_cost(data: ProblemTables) -> CaptionedFigure | None:
     looks = Looks(series(cell.primal, cell.primal_tol, cell.way) for cell in drawn)
     for panel, (title, mine) in zip(sheet.panels, shown, strict=False):
         model = mine.iloc[0]
-        plot(panel, queries, model["hf_setup_s"] + queries * model["hf_s"], HIGH_FIDELITY_LOOK, HIGH_FIDELITY)
+        plot(panel, queries, model["hf_setup_s"] + queries * model["hf_s"], style.HIGH_FIDELITY_LOOK, HIGH_FIDELITY)
         for cell in mine.itertuples():
             key = (cell.primal, cell.primal_tol, cell.way)
             plot(panel, queries, cell.offline_s + queries * cell.online_s, looks[series(*key)], label(*key))
