@@ -101,17 +101,13 @@ def _seconds(stats: Mapping[str, Any], name: str) -> float:
 def table_of(timed: Timed, earlier: Timed | None, limit: float) -> pd.DataFrame:
     """A row for every benchmark; with an earlier file, for every one of both, with what changed."""
     if earlier is None:
-        return pd.DataFrame([_row(name, one) for name, one in timed.benchmarks.items()])
+        return pd.DataFrame([{
+            "benchmark": name, "group": one.group, **{axis: one.axes.get(axis, "") for axis in AXES},
+            "median_s": one.seconds, "q1_s": one.q1, "q3_s": one.q3, "rounds": one.rounds, "status": one.status,
+            **{f"reached_{figure}": value for figure, value in one.accuracy.items()},
+        } for name, one in timed.benchmarks.items()])  # fmt: skip
     both = (name for name in earlier.benchmarks if name in timed.benchmarks)
     return pd.DataFrame([_change(name, earlier.benchmarks[name], timed.benchmarks[name], limit) for name in both])
-
-
-def _row(name: str, one: Measured) -> dict[str, Any]:
-    return {
-        "benchmark": name, "group": one.group, **{axis: one.axes.get(axis, "") for axis in AXES},
-        "median_s": one.seconds, "q1_s": one.q1, "q3_s": one.q3, "rounds": one.rounds, "status": one.status,
-        **{f"reached_{figure}": value for figure, value in one.accuracy.items()},
-    }  # fmt: skip
 
 
 def _change(name: str, was: Measured, now: Measured, limit: float) -> dict[str, Any]:

@@ -194,8 +194,10 @@ class _Run:
         workers: Executor | None = None
         interrupted = False
         try:
-            workers = self._workers() if runnable or untimed else None
-            self.machines = self.machines if workers is None else workers.machines
+            if runnable or untimed:
+                dask, count, log = self.options.executor == "dask", self.options.workers, self.folder / LOG
+                workers = Dask(self.options.scheduler, count, self.store.folder) if dask else Local(count, log)
+                self.machines = workers.machines
             # One training set of a problem is drawn, the first one.
             pictured: dict[Plugin, Stage] = {}
             for cell in cells:
@@ -222,11 +224,6 @@ class _Run:
                 workers.close()
         self.offline.finish()
         return interrupted
-
-    def _workers(self) -> Executor:
-        if self.options.executor == "dask":
-            return Dask(self.options.scheduler, self.options.workers, self.store.folder)
-        return Local(self.options.workers, self.folder / LOG)
 
     def _is_available(self, stage: Stage) -> bool:
         """Whether the artefact of a stage can be reused; its histories are recorded if so."""

@@ -67,7 +67,13 @@ def _check(pack: ModelPack) -> float | None:
     if reference.lam.min() < -1e-8 * np.abs(reference.lam).max():
         if solved:
             raise _explained(pack, reference, int(np.argmin(reference.lam.min(axis=0))))
-        raise _of_signs(reference.lam)
+        # Without a solution u there is nothing that would explain them.
+        if reference.lam.max() <= 1e-8 * np.abs(reference.lam).max():
+            raise RequestError("solutions.lam is negative: λ has the other sign, it is −λ that is nonnegative")
+        row, column = np.unravel_index(reference.lam.argmin(), reference.lam.shape)
+        signs = f"solutions.lam has both signs, {reference.lam.min():.1e} at entry {row} of column {column}"
+        needed = "coefficients that are nonnegative, in a basis in which W⁺ is the cone of nonnegative coefficients"
+        raise RequestError(f"{signs}: λ needs {needed}")
     for k, residual in enumerate(residuals):
         if not residual <= reference.tolerance:
             raise _explained(pack, reference, k)
@@ -120,15 +126,6 @@ def _couplings(matrix: Any) -> Array:
     off = sp.csr_array(matrix - sp.diags_array(matrix.diagonal()))
     off.eliminate_zeros()
     return np.diff(off.indptr)
-
-
-def _of_signs(lam: Array) -> RequestError:
-    """The error for λ that has negative entries, without a solution u that would explain them."""
-    if lam.max() <= 1e-8 * np.abs(lam).max():
-        return RequestError("solutions.lam is negative: λ has the other sign, it is −λ that is nonnegative")
-    i, k = np.unravel_index(lam.argmin(), lam.shape)
-    needed = "λ needs coefficients that are nonnegative, in a basis in which W⁺ is the cone of nonnegative coefficients"
-    return RequestError(f"solutions.lam has both signs, {lam[i, k]:.1e} at entry {i} of column {k}: {needed}")
 
 
 @dataclass(frozen=True)
