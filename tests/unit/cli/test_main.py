@@ -245,7 +245,7 @@ def test_a_run_of_an_odd_name_is_shown(name: str, main: Main, quick_run: Path) -
         assert all(line.isprintable() for line in out.splitlines())
 
 
-def test_help_is_there_for_every_command_word_key_and_column(main: Main) -> None:
+def test_help_is_there_for_every_word_and_former_commands_still_work(main: Main, quick_run: Path) -> None:
     _, out, err = main()
     assert [name for name in ("run", "list", "show") if f"\n  {name} " not in out + err] == []
     assert main("help", "show") == main("show", "--help")
@@ -283,9 +283,6 @@ def test_help_is_there_for_every_command_word_key_and_column(main: Main) -> None
         added = added_columns()[column]
         unit = f" [{added.unit}]" * bool(added.unit)
         assert f"{column}{unit}, in best: {added.meaning}" in main("help", name)[1].splitlines()
-
-
-def test_former_commands_say_what_to_write_now_and_still_work(main: Main, quick_run: Path) -> None:
     for old, new in (
         ("diff a b --limit 2", "compare a b --limit 2 --table changes --strict"),
         ("import my-model", "pack my-model"),

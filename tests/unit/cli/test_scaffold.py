@@ -112,7 +112,7 @@ def test_a_name_that_is_accepted_is_good_everywhere(name: str) -> None:
     assert name.isascii()
 
 
-def test_names_and_places_that_are_taken_are_refused(main: Main) -> None:
+def test_names_and_places_that_are_taken_are_refused_and_kept(main: Main, tmp_path: Path) -> None:
     taken = next(iter(registered(PluginKind.PROBLEM)))
     refused(main("new", "problem", taken), f"there is a problem '{taken}' already", "choose another name")
     refused(main("new", "solver", "piqp"), "there is a QP solver 'piqp' already", "choose another name")
@@ -130,6 +130,13 @@ def test_names_and_places_that_are_taken_are_refused(main: Main) -> None:
     refused(main("new", "problem", "rope", "--out", "file"), "'file' is a file; expected a folder")
     refused(main("new", "problem", "rope", "--out", "file/below"), "'file/below' cannot be made")
     assert {path.name for path in Path.cwd().iterdir()} == {"vibench-rope", "file", f"vibench-{taken}"}
+    into = ("--out", str(tmp_path / "out"))
+    for what in ("study", "pack"):
+        assert main("new", what, "mine", *into)[0] == 0
+        refused(main("new", what, "mine", *into), "exists already")
+        refused(main("new", what, "Not a name", *into), "lower case letters", f"'my-{what}'")
+    refused(main("new", "study", "quick", *into), "there is a study 'quick' already")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"mine", "mine.toml"}
 
 
 def test_nothing_is_left_of_a_package_that_could_not_be_written(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,14 +147,11 @@ def test_nothing_is_left_of_a_package_that_could_not_be_written(main: Main, monk
     assert list(Path.cwd().iterdir()) == []
 
 
-def test_a_new_study_has_cells(main: Main) -> None:
+def test_new_studies_have_cells_and_scripts_of_new_packs_write_them(main: Main) -> None:
     code, out, _ = main("new", "study", "my-study")
     assert (code, out.splitlines()[1]) == (0, "  vibench run my-study.toml --dry-run")
     code, out, _ = main("run", "my-study.toml", "--dry-run")
     assert (code, out.splitlines()[-1]) == (0, "12 cells")
-
-
-def test_the_script_of_a_new_pack_writes_one_that_is_imported(main: Main) -> None:
     _, out, _ = main("new", "pack", "my-model")
     script, check = (line.split()[1:] for line in out.splitlines()[1:])
     assert check == ["pack", "my-model"]
@@ -157,13 +161,3 @@ def test_the_script_of_a_new_pack_writes_one_that_is_imported(main: Main) -> Non
     pack = create("problem", "pack", {"path": "my-model"})
     assert HighFidelitySolver(pack).solve(np.array([4.0, 0.1])).lam.any()
     assert [output.name for output in pack.outputs] == ["mean deflection"]
-
-
-def test_what_is_there_is_kept(main: Main, tmp_path: Path) -> None:
-    into = ("--out", str(tmp_path / "out"))
-    for what in ("study", "pack"):
-        assert main("new", what, "mine", *into)[0] == 0
-        refused(main("new", what, "mine", *into), "exists already")
-        refused(main("new", what, "Not a name", *into), "lower case letters", f"'my-{what}'")
-    refused(main("new", "study", "quick", *into), "there is a study 'quick' already")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"mine", "mine.toml"}

@@ -15,7 +15,7 @@ def imported(command: str, *arguments: str, **environment: str) -> tuple[set[str
     return {line.rsplit("|", 1)[1].strip().split(".")[0] for line in lines}, done.stdout
 
 
-def test_help_and_lists_import_no_library_they_do_not_need(command: str) -> None:
+def test_help_lists_and_completion_import_no_library_they_do_not_need(command: str) -> None:
     """All commands are defined before any prints its help: one stands for the others."""
     for name in ("", "export"):
         packages, printed = imported(command, *name.split(), "--help")
@@ -29,9 +29,6 @@ def test_help_and_lists_import_no_library_they_do_not_need(command: str) -> None
     assert "resolution: " in printed
     assert "skfem" in packages
     assert packages & {"pandas", "matplotlib", "qpsolvers"} == set()
-
-
-def test_completion_imports_no_heavy_library(command: str) -> None:
     for line, word in (
         ("r", "replay"), ("run paper-", "paper-hertz"), ("run --dual ", "mcpg"), ("check ", "obstacle"),
         ("list ", "solvers"), ("show quick --table ", "histories"), ("check obstacle --option ", "resolution="),

@@ -207,7 +207,7 @@ def three(changed: Changed, steady: Path, tmp_path: Path) -> list[Path]:
     return [steady, there, later]
 
 
-def test_what_many_runs_have_and_pairs_of_them_say_is_told(three: list[Path]) -> None:
+def test_what_many_runs_have_is_told_in_every_table_and_format(three: list[Path], main: Main) -> None:
     found = compare(three, 1.25)
     runs = found.by_run.set_index("run")
     assert list(runs["cells"]) == [12, 12, 6]
@@ -241,6 +241,25 @@ def test_what_many_runs_have_and_pairs_of_them_say_is_told(three: list[Path]) ->
     assert set(numbers["against"]) == {"steady"}
     assert "server: times and break-even of different machines or protocols are not compared" in found.notes
     assert not any(note.startswith("later: times") for note in found.notes)
+    paths = list(map(str, three))
+    pair, asked = paths[::2], ("--table", "changes", "--strict")
+    code, listed, _ = main("compare", *pair, *asked, "--format", "csv")
+    assert code == 1
+    assert main("compare", *pair, "--format", "csv") == (0, listed, "")
+    assert main("compare", *pair)[1].endswith(main("compare", *pair, *asked)[1])
+    for table, rows in (("changes", 14), ("runs", 3), ("cells", 6)):
+        code, text, _ = main("compare", *paths, "--table", table, "--format", "json")
+        assert code == 0
+        assert len(json.loads(text)) == rows
+    assert main("compare", *paths, "--table", "runs", "--format", "markdown")[1].startswith("|")
+    columns = json.loads(main("compare", *paths, "--table", "columns", "--format", "json")[1])
+    about = ("error_u_mean", "later", "steady")
+    (found,) = (row for row in columns if (row["what"], row["run"], row["against"]) == about)
+    assert (found["cells"], found["equal"], found["worse"], found["ratio"]) == (6, 5, 1, 1.0)
+    assert found["farthest_ratio"] == pytest.approx(4.0)
+    code, text, _ = main("compare", *paths, "--column", "N", "--format", "csv")
+    assert code == 0
+    assert text.splitlines()[0].endswith(",cell,steady,server,later")
 
 
 def test_a_comparison_fits_the_terminal_and_what_it_is_about_is_shown(
@@ -264,28 +283,6 @@ def test_a_comparison_fits_the_terminal_and_what_it_is_about_is_shown(
         assert all(re.search(words, shown) for words in (r"before +after", r"present +gone", r"ok +error"))
     _, shown, _ = main("compare", str(quick_run), str(other), "--table", "cells")
     assert re.search(r"yes +no|quick yes, .* no", shown)
-
-
-def test_every_table_of_a_comparison_has_every_format(three: list[Path], main: Main) -> None:
-    paths = list(map(str, three))
-    pair, asked = paths[::2], ("--table", "changes", "--strict")
-    code, listed, _ = main("compare", *pair, *asked, "--format", "csv")
-    assert code == 1
-    assert main("compare", *pair, "--format", "csv") == (0, listed, "")
-    assert main("compare", *pair)[1].endswith(main("compare", *pair, *asked)[1])
-    for table, rows in (("changes", 14), ("runs", 3), ("cells", 6)):
-        code, text, _ = main("compare", *paths, "--table", table, "--format", "json")
-        assert code == 0
-        assert len(json.loads(text)) == rows
-    assert main("compare", *paths, "--table", "runs", "--format", "markdown")[1].startswith("|")
-    columns = json.loads(main("compare", *paths, "--table", "columns", "--format", "json")[1])
-    about = ("error_u_mean", "later", "steady")
-    (found,) = (row for row in columns if (row["what"], row["run"], row["against"]) == about)
-    assert (found["cells"], found["equal"], found["worse"], found["ratio"]) == (6, 5, 1, 1.0)
-    assert found["farthest_ratio"] == pytest.approx(4.0)
-    code, text, _ = main("compare", *paths, "--column", "N", "--format", "csv")
-    assert code == 0
-    assert text.splitlines()[0].endswith(",cell,steady,server,later")
 
 
 def test_runs_of_folders_with_the_same_name_are_told_apart(tmp_path: Path) -> None:

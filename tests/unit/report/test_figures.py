@@ -317,8 +317,17 @@ def test_every_strategy_is_drawn_ten_to_a_panel(count: int, tables: Tables) -> N
     assert in_tens(spans) == count + len(spans)  # the high-fidelity pair is in each
 
 
-def test_thresholds_are_marked_where_the_lines_cross(results: Path, change: Change) -> None:
-    """With their intervals; however many there are, a panel has one artist for each meaning and one for intervals."""
+def test_the_tightest_enrichment_went_farthest_thresholds_where_lines_cross(results: Path, change: Change) -> None:
+    """Whichever way its tolerance runs, and however many training parameters there are."""
+    mine = dict(of_file(results))["obstacle"].restrict_to_dual("mcpg")
+    steps = mine.histories[mine.histories["quantity"] == "beta_span_min"]
+    last = steps[steps["step"] == steps["step"].max()].assign(step=steps["step"].max() + 1)
+    tighter = pd.concat([steps, last]).assign(primal_tol=0.9, artefact="tighter")
+    for tolerance in (0.5, 0.95):
+        both = pd.concat([steps.assign(primal_tol=tolerance), tighter])
+        ((_, found),) = spaces.longest(both, "primal")
+        assert set(found["primal_tol"]) == {0.9}
+    # With their intervals; however many there are, a panel has one artist for each meaning and one for intervals.
     change(*DECIDED)
     data = dict(of_file(results))["obstacle"]
     figure, seen = costs.total_cost(data), 0
@@ -440,18 +449,6 @@ def test_a_figure_that_fails_costs_itself_and_progress_names_every_one(
     shown: list[tuple[str, int, int]] = []
     draw_all(results, tmp_path, ("svg",), lambda *now: shown.append(now))
     assert shown == [("obstacle-solvers", 0, 2), ("obstacle-mcpg-inf-sup", 1, 2), ("", 2, 2)]
-
-
-def test_the_tightest_enrichment_is_the_one_that_went_farthest(results: Path) -> None:
-    """Whichever way its tolerance runs, and however many training parameters there are."""
-    mine = dict(of_file(results))["obstacle"].restrict_to_dual("mcpg")
-    steps = mine.histories[mine.histories["quantity"] == "beta_span_min"]
-    last = steps[steps["step"] == steps["step"].max()].assign(step=steps["step"].max() + 1)
-    tighter = pd.concat([steps, last]).assign(primal_tol=0.9, artefact="tighter")
-    for tolerance in (0.5, 0.95):
-        both = pd.concat([steps.assign(primal_tol=tolerance), tighter])
-        ((_, found),) = spaces.longest(both, "primal")
-        assert set(found["primal_tol"]) == {0.9}
 
 
 def test_a_caption_says_which_tolerances_are_left_out(change: Change, draw: Draw) -> None:

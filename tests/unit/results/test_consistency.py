@@ -56,7 +56,7 @@ def answer(solver: str, query: int, *x: float) -> Recorded:
     return Recorded(solver, query, np.array(x), Slack(0.01, 0.0))
 
 
-def test_two_solvers_far_apart_are_flagged_at_their_query() -> None:
+def test_two_solvers_far_apart_are_flagged_and_only_ok_answers_of_one_model_compared() -> None:
     answers = [answer("b", 0, 1.0, 0.0), answer("b", 3, 0.0, 2.0), answer("b", 4, 1.0, 1.0)]
     answers += [answer("a", 0, 1.0, 0.01), answer("a", 3, 0.0, 2.5), answer("a", 9, 5.0, 5.0)]
     (row,) = compare(answers)
@@ -65,8 +65,6 @@ def test_two_solvers_far_apart_are_flagged_at_their_query() -> None:
     assert row["difference_max"] == pytest.approx(0.5 / 2.5)
     assert row["allowed_worst"] == pytest.approx(0.02 / 2.5)
 
-
-def test_only_ok_answers_of_the_same_reduced_model_are_compared() -> None:
     def cell(key: str, solver: str, model: str | None) -> dict[str, object]:
         names = {"cell": key, "solver": solver, "model": model, "dual": f"of {model}", "accuracy": 1e-7}
         names["formulation"] = "mixed"

@@ -40,9 +40,6 @@ def test_the_fastest_query_within_the_error_is_the_best_and_says_when_it_pays() 
     (best,) = judged(ENRICHED, ENRICHED | {"online_s": 5e-3, "hf_s": 0.2})
     assert best.best is not None
     assert best.best["cell"] == "c1"
-
-
-def test_every_meaning_of_a_break_even_has_its_words() -> None:
     for meaning, words in (
         ("until", "cheaper up to 25 queries (95 %"), ("at once", "from the first query on"), ("never", "never pays"),
         ("as fast", "does not pay"), ("undecided", "is undecided"),
