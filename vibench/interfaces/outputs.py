@@ -178,9 +178,8 @@ class MeshFields:
         line = {"line": np.column_stack([order[:-1], order[1:]])}
         cells = {"triangle": picture.triangles.T} if picture.triangles.size else line
         at_points = {picture.name: np.concatenate([values, np.full(len(vertices), np.nan)])}
-        return cls(
-            points, cells | {"vertex": vertices}, at_points, {"vertex": {picture.multiplier_name: picture.multiplier}}
-        )
+        in_cells = {"vertex": {picture.multiplier_name: picture.multiplier}}
+        return cls(points, cells | {"vertex": vertices}, at_points, in_cells)
 
 
 def _node_counts() -> dict[str, int]:

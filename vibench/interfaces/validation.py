@@ -126,10 +126,9 @@ def checked_assembly(problem: Problem, mu: Annotated[Array, "d"]) -> Variational
         too_large = peak >= 0.5 * ABSENT and name != "g"
         too_small = 0.0 < peak < 1.0 / largest and name in ("A", "B")
         if too_large or too_small:
-            raise NumericalError(
-                f"{name} has entries of up to {peak:.0e} at mu = {mu.tolist()}; products of such numbers over- or "
-                f"underflow: choose units in which they are between {1.0 / largest:.0e} and {largest:.0e}"
-            )
+            remedy = f"choose units in which they are between {1.0 / largest:.0e} and {largest:.0e}"
+            found = f"{name} has entries of up to {peak:.0e} at mu = {mu.tolist()}"
+            raise NumericalError(f"{found}; products of such numbers over- or underflow: {remedy}")
     with at_parameter(mu):
         return settled(vi)
 

@@ -75,11 +75,10 @@ class Citation:
         fields = {
             "title": f"{{{_in_braces(self.title)}}}",
             "author": " and ".join(name if "," in name else f"{{{name}}}" for name in names),
-            "year": self.date.partition("-")[0],
-            "doi": self.doi,
+            "year": self.date.partition("-")[0], "doi": self.doi,
             "url": unbroken(self.url).replace("{", "%7B").replace("}", "%7D"),
             "note": f"Computed by vibench {distribution_version('vibench')}",
-        }
+        }  # fmt: skip
         lines = (f"  {name} = {{{value}}}," for name, value in fields.items() if value)
         return "@misc{vibench-results,\n" + "\n".join(lines) + "\n}\n"
 

@@ -82,10 +82,9 @@ def _by_problem(cells: pd.DataFrame, queries: pd.DataFrame) -> Iterator[str]:
         # Three parameters or fewer exclude nothing.
         if count > 3 and mine["certificate"].isin(("certified", "verified")).any():
             # If a share p of the box were false, k random parameters would all miss it with probability (1 - p)^k.
-            yield (
-                f"Declarations of {problem} agree with the assembly at all {count} validation parameters. Where these "
-                f"are drawn at random, as by default, one is false in at most {3.0 / count:.2g} of the box, at 95 %."
-            )
+            agree = f"Declarations of {problem} agree with the assembly at all {count} validation parameters"
+            share = f"one is false in at most {3.0 / count:.2g} of the box, at 95 %"
+            yield f"{agree}. Where these are drawn at random, as by default, {share}."
     for name, symbol in (("u", "u"), ("lambda", "λ")):
         for problem, mine in queries[queries[f"zero_{name}"] == 1].groupby("problem", sort=False):
             count = mine["query"].nunique()

@@ -112,10 +112,9 @@ LARGEST_BAND = 0.1
 
 def no_best_cell() -> str:
     """Reason why a run may have no best cell."""
-    return (
-        f"no cell takes part in the comparison: one that does has every query ok, mean errors of at most "
-        f"{100.0 * LARGEST_BAND:g} %, and less than 10 % of an error made by the QP solver, and by reduced assembly"
-    )
+    parts = "less than 10 % of an error made by the QP solver, and by reduced assembly"
+    needed = f"every query ok, mean errors of at most {100.0 * LARGEST_BAND:g} %, and {parts}"
+    return f"no cell takes part in the comparison: one that does has {needed}"
 
 
 def excluded(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFrame:

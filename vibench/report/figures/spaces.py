@@ -63,10 +63,8 @@ def cone_errors(title: str, steps: pd.DataFrame) -> CaptionedFigure:
     sheet = Sheet.with_panels(len(groups), f"{title}: projection errors of the multipliers", share="all")
     for panel, group in zip(sheet.panels, groups, strict=False):
         _cones(panel, group)
-    return sheet.finish(
-        f"Largest relative distance of a multiplier of {title} from the cone of the first R generators, for every dual "
-        "strategy."
-    )
+    distance = f"Largest relative distance of a multiplier of {title} from the cone of the first R generators"
+    return sheet.finish(f"{distance}, for every dual strategy.")
 
 
 def _cones(panel: Axes, cones: Sequence[tuple[str, pd.DataFrame]]) -> None:
