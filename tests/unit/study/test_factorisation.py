@@ -75,7 +75,10 @@ def test_a_study_chooses_for_its_problems_and_a_problem_for_itself() -> None:
         create("problem", "obstacle", {"factorisation": "superlo"})
 
 
-def test_available_and_missing_implementations_are_named() -> None:
+def test_available_and_missing_implementations_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    # It can be imported here, too.
+    monkeypatch.setitem(vars(factorisations.IMPLEMENTATIONS["pardiso"]), "fault", "")
+
     def plugin() -> Plugin:
         return Plugin.of(find(PluginKind.PROBLEM, "hertz"), {"factorisation": "available"})
 
