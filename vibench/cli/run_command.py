@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -136,7 +137,8 @@ def _problem(text: str) -> Any:
 
     from vibench.packs.manifest import FILE
 
-    if (Path(text) / FILE).is_file():
+    # Methods of Path raise an OSError if a name is too long for a file.
+    if os.path.isfile(os.path.join(text, FILE)):  # noqa: PTH113, PTH118
         return {"name": "pack", "label": Path(text).absolute().name, "options": {"path": str(Path(text).absolute())}}
     file, _, name = text.rpartition(":")
     if not file.endswith(".py"):

@@ -135,7 +135,7 @@ def test_a_problem_alone_is_run_with_the_usual_choices(main: Main, tmp_path: Pat
     assert ended.call_args.args[:2][1] == Path("runs/Own")
     for problem, said in (
         (f"{tmp_path}/own.py:Onw", "did you mean 'Own'"), (f"{tmp_path}/broken.py:Own", "division by zero"),
-        (str(tmp_path), "pack.toml: format: required"),
+        (str(tmp_path), "pack.toml: format: required"), ("a" * 5000, "(5000 characters)"),
     ):  # fmt: skip
         code, _, err = main("run", "--problem", problem, "--dry-run")
         assert (code, err.count("\n")) == (2, 1)
