@@ -40,6 +40,7 @@ Positive = Annotated[float, Rule("a positive finite number", lambda value: value
 NotNegative = Annotated[float, Rule("a number of at least 0", lambda value: value >= 0.0)]
 # No memory holds arrays of a larger size.
 Count = Annotated[int, Rule("a whole number of at least 0", lambda value: 0 <= value < 2**31)]
+AtLeastOne = Annotated[int, Rule("a whole number of at least 1", lambda value: 1 <= value < 2**31)]
 Seed = Annotated[int, Rule("a whole number of at least 0", lambda value: value >= 0)]
 
 

@@ -59,7 +59,7 @@ def shown(value: object) -> str:
     try:
         return f"the class {value.__qualname__}" if isinstance(value, type) else brief(repr(value), 80)
     except Exception:  # noqa: BLE001  `__repr__` of a stranger may raise anything
-        return f"a {type(value).__name__}"
+        return f"{'an' if (name := type(value).__name__)[0] in 'aeiouAEIO' else 'a'} {name}"
 
 
 def one_line(text: str) -> str:

@@ -37,6 +37,7 @@ from vibench.stages.timing_rounds import QUERY_SUBSETS, TimingRounds
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand
 from vibench.study.spec import Study
+from vibench.text import shown
 
 
 @dataclass(frozen=True)
@@ -115,12 +116,12 @@ class Options:
 
     def __post_init__(self) -> None:
         if not 0 <= self.repeats <= 100:
-            raise RequestError(f"repeats is {self.repeats}, expected 0 to 100 processes")
+            raise RequestError(f"repeats is {shown(self.repeats)}, expected 0 to 100 processes")
         # More than one process per core makes a run slower, and thousands stop the machine.
         most = 16 * provenance.cores()
         if not 0 <= self.jobs <= most:
             what = f"at most {most} worker processes, 16 per core, or 0 for one per core"
-            raise RequestError(f"jobs is {self.jobs}, expected {what}")
+            raise RequestError(f"jobs is {shown(self.jobs)}, expected {what}")
 
     @property
     def workers(self) -> int:

@@ -76,13 +76,13 @@ class HighFidelitySolver:
         self._active: list[Mask] = []
 
     @bordered
-    def solve(self, mu: Annotated[Array, "d"], vi: VariationalInequality | None = None) -> HighFidelitySolution:
-        """Assemble and solve at mu (d,), or solve what has been assembled there.
+    def solve(self, mu: Annotated[Array, "d"]) -> HighFidelitySolution:
+        """Assemble and solve at mu (d,).
 
         Raises a `NumericalError` if the assembly is invalid, the solution does not reach `ACCURACY`, the problem
         refuses it, or B touches unknowns outside the declared `contact_dofs`.
         """
-        return self.solve_next(mu, vi or checked_assembly(self._problem, mu))
+        return self.solve_next(mu, checked_assembly(self._problem, mu))
 
     def solve_next(self, mu: Array, vi: VariationalInequality) -> HighFidelitySolution:
         """As `solve`, of what vibench itself has assembled: checks would take a tenth of a solution that is timed."""

@@ -29,6 +29,7 @@ from vibench.errors import RequestError
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, PrimalStrategy, Stop
 from vibench.signatures import bordered
+from vibench.text import shown
 
 # The layers above define these classes; nothing here imports them.
 AssemblingModel: TypeAlias = Any
@@ -310,9 +311,10 @@ def axes_of(formulation: type[Formulation] | Formulation, title: str) -> tuple[s
     Raises a `RequestError` if there is no such axis, or an enrichment without V_N and cone.
     """
     declared = formulation.uses
-    if not isinstance(declared, tuple) or not set(declared) <= set(AXES):
-        raise RequestError(f"the {title} declares uses = {declared!r}, expected a tuple of some of {', '.join(AXES)}")
+    if not isinstance(declared, tuple) or not all(one in AXES for one in declared):
+        uses = f"uses = {shown(declared)}"
+        raise RequestError(f"the {title} declares {uses}, expected a tuple of some of {', '.join(AXES)}")
     # An enrichment enriches V_N, for the generators of a cone.
     if "primal" in declared and not {"pod", "dual"} <= set(declared):
-        raise RequestError(f"the {title} declares uses = {declared!r}: 'primal' needs 'pod' and 'dual'")
+        raise RequestError(f"the {title} declares uses = {shown(declared)}: 'primal' needs 'pod' and 'dual'")
     return tuple(axis for axis in AXES if axis in declared)

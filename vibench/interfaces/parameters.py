@@ -10,7 +10,7 @@ import numpy as np
 
 from vibench.arrays import Array, Mask
 from vibench.errors import RequestError, unknown_name
-from vibench.signatures import Count, Seed, bordered
+from vibench.signatures import AtLeastOne, Count, Seed, bordered
 from vibench.text import normal_name
 
 
@@ -52,7 +52,7 @@ class ParameterBox:
         # A parameter that does not vary is measured by its size, one near zero by 1.
         return np.where(self.upper > self.lower, self.upper - self.lower, np.maximum(np.abs(self.lower), 1.0))
 
-    def grid(self, *counts: Count) -> Array:
+    def grid(self, *counts: AtLeastOne) -> Array:
         """Regular grid (P×d) with `counts` points per direction; the last parameter varies fastest."""
         if len(counts) != self.dim:
             raise RequestError(f"{len(counts)} counts of a grid for {self.dim} parameters, expected one for each")

@@ -31,7 +31,7 @@ from vibench.offline.models import Model
 from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, InaccurateError, declared_terms, member_polynomials
 from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS
-from vibench.signatures import Count, Share, bordered
+from vibench.signatures import AtLeastOne, Share, bordered
 from vibench.study.cells import Cell
 
 
@@ -60,7 +60,7 @@ def export_model(
     model: Model,
     file: Path | str,
     tolerance: Share = TOLERANCE,
-    evaluations: Count = EVALUATIONS,
+    evaluations: AtLeastOne = EVALUATIONS,
     bases: bool = True,
     c: bool = False,
 ) -> ExportedModel:

@@ -19,7 +19,7 @@ from vibench.errors import NumericalError, RequestError, UnsupportedError, forei
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
 from vibench.linalg.definite import BlockDiagonal, Elimination, Factor, FactoredElimination, checked
 from vibench.provenance import distribution_version
-from vibench.text import brief
+from vibench.text import shown
 
 
 class _Empty(Factor):
@@ -164,7 +164,7 @@ def implementation(name: str) -> Implementation:
     Raises a `RequestError` if there is none of this name.
     """
     if not isinstance(name, str):
-        raise RequestError(f"the factorisation is {brief(repr(name), 80)}, expected the name of one")
+        raise RequestError(f"the factorisation is {shown(name)}, expected the name of one")
     if name == "available":
         fastest_first = (IMPLEMENTATIONS[one] for one in ("pardiso", "cholmod", DEFAULT))
         return next(one for one in fastest_first if one.is_installed and not one.fault)

@@ -39,7 +39,7 @@ from vibench.qp.solve import installed_solvers, solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
 from vibench.signatures import Judged, Positive, Share, bordered, constructed
-from vibench.text import brief, normal_name, shown
+from vibench.text import normal_name, shown
 from vibench.timing import NO_TIME, Seconds, timed
 
 if TYPE_CHECKING:
@@ -166,10 +166,9 @@ class Model:
         dimension, added = getattr(made, "dimension", None), made.enrichment or 0
         for name, size in (("dimension", dimension), ("generators", made.generators or 0), ("enrichment", added)):
             if not is_count(size):
-                found = f"`{name}` of the model is {brief(repr(size), 80)}"
-                raise NumericalError(f"{found}, expected a whole number of at least 0")
+                raise NumericalError(f"`{name}` of the model is {shown(size)}, expected a whole number of at least 0")
         if added > made.dimension:
-            raise NumericalError(f"`enrichment` of the model is {added}, more than its `dimension`, {dimension}")
+            raise NumericalError(f"`enrichment` of the model is {shown(added)}, more than its `dimension`, {dimension}")
         if self.formulation.has_program and not hasattr(made, "reduced"):
             raise NumericalError("the formulation declares `has_program`, but its model has no `reduced`")
         return made
@@ -509,7 +508,7 @@ def _taken(answer: object, model: FormulationModel) -> FormulationAnswer:
         ("uncertainty", isinstance(estimate, Real) and 0.0 <= float(estimate) < inf, "a number of at least 0"),
     ):  # fmt: skip
         if not fine:
-            raise NumericalError(f"{name} of the answer is {brief(repr(getattr(answer, name)), 80)}, expected {right}")
+            raise NumericalError(f"{name} of the answer is {shown(getattr(answer, name))}, expected {right}")
     return replace(answer, x=vectors["x"], alpha=vectors["alpha"])
 
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, get_type_hints
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from vibench.errors import RequestError, in_a_line, unknown_name
+from vibench.text import shown
 
 
 class Option(NamedTuple):
@@ -24,7 +25,7 @@ class Option(NamedTuple):
     preset: Any
 
     def __str__(self) -> str:
-        return f"{self.name}: {self.expected}" + f" = {self.preset!r}" * (not self.required)
+        return f"{self.name}: {self.expected}" + f" = {shown(self.preset)}" * (not self.required)
 
     @property
     def required(self) -> bool:
@@ -54,7 +55,7 @@ class Option(NamedTuple):
         except PydanticUserError as error:
             return f"has an annotation that no value of a study file conforms to: {in_a_line(error)}"
         except ValidationError:
-            return f"has the default {self.preset!r}; its annotation expects {expected}"
+            return f"has the default {shown(self.preset)}; its annotation expects {expected}"
         return ""
 
 
@@ -104,9 +105,9 @@ def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict
         if name in given:
             try:
                 checked[name] = option.read(given[name])
-            except ValidationError:
+            except Exception:  # noqa: BLE001  pydantic's error, or what texts and numbers of strangers raise
                 expected = option.expected
-                raise RequestError(f"option '{name}' of {what} is {given[name]!r}; expected {expected}") from None
+                raise RequestError(f"option '{name}' of {what} is {shown(given[name])}; expected {expected}") from None
         elif option.required:
             raise RequestError(f"{what} needs the option '{name}' ({option.expected})")
     return checked

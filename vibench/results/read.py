@@ -15,7 +15,7 @@ from vibench.results import ranking
 from vibench.results.break_even import Meaning
 from vibench.results.schema import KEYS, STORED, TABLES, VERSION, Column, SqlType, column_of
 from vibench.results.sqlite import FILE, Part, read_meta, read_parts, read_rows
-from vibench.text import brief, json_object
+from vibench.text import json_object, shown
 
 
 def results_file(run: str) -> Path:
@@ -68,7 +68,7 @@ def checked(path: Path, table: str, part: Part) -> Part:
         is_right, right = _expected(column, name)
         for value in dict.fromkeys(values):
             if value is not None and not is_right(value):
-                strange = f"{brief(repr(value), 60)} in the column '{name}' of '{table}'"
+                strange = f"{shown(value)} in the column '{name}' of '{table}'"
                 raise RequestError(f"'{path}' has {strange}, expected {right}")
     return part
 

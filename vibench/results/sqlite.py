@@ -20,7 +20,7 @@ from vibench.errors import RequestError
 from vibench.files import scratch
 from vibench.qp.status import Status
 from vibench.results.schema import STORED, VERSION
-from vibench.text import brief, json_object, one_line, printable
+from vibench.text import json_object, one_line, printable, shown
 
 
 class DigestError(Exception):
@@ -207,7 +207,7 @@ def parameters_of(path: Path) -> dict[str, list[tuple[str, str]]]:
         try:
             found[key.removeprefix("parameters of ")] = [(str(name), str(unit)) for name, unit in json.loads(text)]
         except (TypeError, ValueError):
-            strange = f"{brief(repr(text), 60)} as the {key}"
+            strange = f"{shown(text)} as the {key}"
             raise DamagedResultsError(f"'{path}' has {strange}, expected pairs of texts") from None
     return found
 

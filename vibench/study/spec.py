@@ -374,7 +374,7 @@ class Study(_Model):
 def _in_present_words(given: Any) -> Any:
     """A study in the words of before: "certified" and "compiled" were assemblies. A warning says what to write now."""
     assembly = given.get("assembly") if isinstance(given, dict) else None
-    if not isinstance(assembly, list) or not (before := {"certified", "compiled"}.intersection(map(str, assembly))):
+    if not isinstance(assembly, list) or not (before := [w for w in ("certified", "compiled") if w in assembly]):
         return given
     now = dict(given) | {"assembly": [word for word in assembly if word not in before]}
     if "certified" in before:
