@@ -124,7 +124,7 @@ class _Signature:
         try:
             return self._signature.bind(*given, **named).arguments
         except TypeError as error:
-            for name in named.keys() - self._rules.keys():
+            for name in sorted(named.keys() - self._rules.keys()):
                 raise unknown_name(f"argument of {self._title}", name, self._rules) from None
             raise RequestError(f"{self._title}: {error}") from None
 

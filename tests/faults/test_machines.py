@@ -66,7 +66,7 @@ def test_a_distribution_with_unreadable_entry_points_costs_its_own(
     shutil.copytree(plugins_folder, site)
     for name, content in (
         ("bytes", b"\xff\xfe[vibench.problems]\n"), ("words", b"[vibench.problems]\nno entry\n"),
-        ("groups", b"[vibench.formulation]\nmine = a:B\n"),
+        ("groups", b"".join(b"[vibench.%s]\nmine = a:B\n" % name for name in (b"study", b"formulation", b"problem"))),
     ):  # fmt: skip
         information = site / f"{name}-1.0.dist-info"
         information.mkdir()

@@ -82,6 +82,9 @@ class Tangled(Declared):
             raise ValueError("mesh tangled")
         return super().assemble(mu)
 
+    def contact(self, mu: Array) -> Contact | None:
+        return None if (self.wrong == mu).all(axis=1).any() else super().contact(mu)
+
 
 class TangledThird(Tangled):
     """The mesh is tangled at the third training parameter."""

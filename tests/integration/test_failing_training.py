@@ -47,7 +47,17 @@ def reduction(problem: Declared, on_failure: str) -> Reduction:
     return pga_reduction(problem, 1e-3, assembly="reduced", on_failure=on_failure)
 
 
-def test_what_failed_solutions_take_is_offline_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+class Lost(vibench.AdaptiveSampling):
+    def parameters(self, box: vibench.ParameterBox) -> np.ndarray:
+        return box.grid(2, 2)
+
+    def train(self, box: vibench.ParameterBox, trainer: vibench.Trainer) -> None:
+        raise KeyError("lost")
+
+
+def test_failed_solutions_are_offline_time_and_samplings_have_own_faults(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cell, clock, assemble = expand(study({"name": "own", "on_failure": "skip"}))[0], [0.0], Tangled.assemble
 
     def slow(problem: Tangled, mu: np.ndarray) -> vibench.VariationalInequality:
@@ -57,6 +67,9 @@ def test_what_failed_solutions_take_is_offline_time(tmp_path: Path, monkeypatch:
     monkeypatch.setattr("vibench.timing.process_time", lambda: clock[0])
     monkeypatch.setattr(Tangled, "assemble", slow)
     stages = solution_stages(cell.problem, cell.training)
+    (lost,) = solution_stages(cell.problem, expand(study([Lost]))[0].training)
+    with pytest.raises(NumericalError, match="the sampling strategy 'Lost' raised KeyError: 'lost'; run"):
+        lost.run(Store(tmp_path))
     assert sum(stage.run(Store(tmp_path)).seconds.cpu for stage in stages) == 7.0
 
 

@@ -7,7 +7,6 @@ import platform
 import re
 import shutil
 import sqlite3
-import tempfile
 from collections.abc import Iterator
 from contextlib import closing
 from enum import StrEnum
@@ -26,7 +25,7 @@ from vibench import provenance
 from vibench.cli.console import echo, shown
 from vibench.errors import RequestError, in_a_line
 from vibench.execution.isolated import solver_trials
-from vibench.files import locked
+from vibench.files import locked, scratch
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.factorisations import IMPLEMENTATIONS
 from vibench.plugins.kinds import PluginKind
@@ -214,9 +213,9 @@ def _folder(subject: str, folder: Path) -> Diagnosis:
     try:
         free = shutil.disk_usage(existing).free / 2**30
         with (
-            tempfile.TemporaryDirectory(dir=existing, prefix=".vibench-") as scratch,
-            locked(Store(Path(scratch)).lock, busy="a new lock is already held"),
-            closing(sqlite3.connect(Path(scratch, "trial.sqlite"))) as db,
+            scratch(existing) as trial,
+            locked(Store(trial).lock, busy="a new lock is already held"),
+            closing(sqlite3.connect(trial / "trial.sqlite")) as db,
         ):
             mode = db.execute("PRAGMA journal_mode=WAL").fetchone()[0]
             db.execute("CREATE TABLE trial (number)")

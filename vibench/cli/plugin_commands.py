@@ -313,11 +313,10 @@ def bench_plugins(
 def _timed(plugins: list[str], out: Path | None, resolutions: list[str], study: str, seconds: float | None) -> Timed:
     """Time plugins by pytest-benchmark, and keep its file if asked to."""
     from importlib.util import find_spec
-    from tempfile import TemporaryDirectory
 
     from vibench import benchmarks
     from vibench.benchmarks.comparison import read_benchmarks
-    from vibench.files import write_atomically, writing
+    from vibench.files import scratch, write_atomically, writing
 
     if find_spec("pytest_benchmark") is None:
         raise VibenchError("`vibench bench` needs pytest-benchmark: pip install 'vibench[bench]'")
@@ -325,8 +324,8 @@ def _timed(plugins: list[str], out: Path | None, resolutions: list[str], study: 
     benchmarks.setting(study), benchmarks.chosen_plugins(plugins), benchmarks.resolutions(resolutions)
     if out is not None and not out.absolute().parent.is_dir():
         raise RequestError(f"'{out}' cannot be written: '{out.absolute().parent}' is not a folder")
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / "benchmarks.json"
+    with scratch() as folder:
+        file = folder / "benchmarks.json"
         options = [f"--plugin={name}" for name in plugins] + [f"--resolution={name}" for name in resolutions]
         options += [f"--study={study}", *([] if seconds is None else [f"--seconds={seconds}"])]
         benchmarks.run_pytest([*options, f"--benchmark-json={file}"])

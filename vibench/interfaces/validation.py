@@ -156,11 +156,11 @@ class Fingerprint:
                 yield f"row {int(np.argmax(np.where(np.isnan(gap), np.inf, gap)))} of {name} differs"
 
 
-def fingerprint(problem: Problem, vi: VariationalInequality) -> Fingerprint:
-    """The fingerprint of `vi`, an assembly of the problem, and of its inner products."""
+def fingerprint(problem: Problem, mu: Array, vi: VariationalInequality) -> Fingerprint:
+    """The fingerprint of `vi`, the assembly at mu (d,), of the `contact` there, and of the inner products."""
     arrays, box = {name: getattr(vi, name) for name in MEMBERS}, problem.parameters
     arrays |= {"X_V": problem.V.matrix, "X_W": problem.W.matrix, "the box": np.append(box.lower, box.upper)}
-    if problem.has_contact and (contact := problem.contact(training_parameters(problem)[0])) is not None:
+    if problem.has_contact and (contact := problem.contact(mu.copy())) is not None:
         arrays["B of `contact`"] = contact.B
     return _fingerprint(arrays)
 
@@ -269,8 +269,8 @@ class ReferenceAssembly:
     """The `first_assembly` of a problem, as this returned it; assemblies at other parameters are compared with it."""
 
     def __init__(self, problem: Problem) -> None:
-        self._problem, self._vi, self._compared = problem, first_assembly(problem), 0
-        self.fingerprint = fingerprint(problem, self._vi)
+        (mu, self._vi), self._problem, self._compared = first_assembly(problem), problem, 0
+        self.fingerprint = fingerprint(problem, mu, self._vi)
 
     def refuse_false_declarations(self, mu: Array, vi: VariationalInequality) -> None:
         """Raise a `NumericalError` if a declaration, such as `constant`, `affine` or `contact`, differs from `vi`."""
@@ -301,12 +301,12 @@ class ReferenceAssembly:
             raise NumericalError(f"a member declared `constant` is overwritten by later assemblies: {deviation}")
 
 
-def first_assembly(problem: Problem) -> VariationalInequality:
-    """The assembly at the first of the problem's own training parameters that has one; raises that of the first."""
+def first_assembly(problem: Problem) -> tuple[Array, VariationalInequality]:
+    """The first of the problem's own training parameters (d,) with an assembly, and that; raises that of the first."""
     errors = list[NumericalError]()
     for mu in training_parameters(problem):
         try:
-            return checked_assembly(problem, mu)
+            return mu, checked_assembly(problem, mu)
         except NumericalError as error:
             errors.append(error)
     raise errors[0]

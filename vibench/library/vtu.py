@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import tempfile
 from collections import defaultdict
 from itertools import chain
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
-from vibench.files import write_atomically, writing
+from vibench.files import scratch, write_atomically, writing
 from vibench.interfaces.outputs import MeshFields
 from vibench.offline.models import Model, Parameters
 
@@ -81,9 +80,9 @@ def _written(exact: MeshFields, reduced: MeshFields) -> bytes:
     cells = [(owner, corners.astype(np.int64)) for owner, corners in exact.cells.items()]
     mesh = meshio.Mesh(exact.points, cells, point_data=at_points, cell_data=in_cells)
     # meshio writes only to named files; a scratch file keeps the final one complete or absent.
-    with tempfile.TemporaryDirectory() as scratch:
-        mesh.write(Path(scratch) / "fields.vtu")
-        return (Path(scratch) / "fields.vtu").read_bytes()
+    with scratch() as folder:
+        mesh.write(folder / "fields.vtu")
+        return (folder / "fields.vtu").read_bytes()
 
 
 def _compared(exact: Array, reduced: Array) -> list[tuple[str, Array]]:

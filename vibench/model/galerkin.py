@@ -219,7 +219,7 @@ def projected_members(
     them. A and f have to be constant or affine, or among those left out.
     """
     names = [name for name in MEMBERS if name not in left_out]
-    of, vi = projections(Z, chi), first_assembly(problem)
+    of, (_, vi) = projections(Z, chi), first_assembly(problem)
     constant = {name: of[name](getattr(vi, name)) for name in names if name in problem.constant}
     affine = {n: problem.affine[n].mapped(of[n]) for n in names if n in problem.affine and n not in constant}
     left = [name for name in names if name not in constant and name not in affine]

@@ -237,10 +237,11 @@ class AdaptiveTraining(Stage):
         """Train; histories are the bounds that led to solutions, the parameters, and the number of bounds so far."""
         assert self.training.sampling is not None  # a problem's own set is not adaptive
         with faults_of(self.problem):
-            problem, strategy = build_problem(self.problem), self.training.sampling.create()
+            problem = build_problem(self.problem)
             reference = ReferenceAssembly(problem)
             trainer = GreedyTrainer(problem, reference)
-            strategy.train(problem.parameters, trainer)
+            with faults_of(self.training.sampling):
+                self.training.sampling.create().train(problem.parameters, trainer)
             reference.refuse_rewritten_constants()
         solved = trainer.solved
         if not solved:

@@ -112,7 +112,7 @@ class Cell:
         recorded = ((name, part) for name, part in content.items() if isinstance(part, dict) and "code" in part)
         plugins = {name: Plugin(**part) for name, part in recorded}
         known = {name for one in plugins.values() if places for name in one.paths.values()}
-        for name in places.keys() - known:
+        for name in sorted(places.keys() - known):
             raise unknown_name("file or folder of the cell", name, known)
         # In the committed results `mixed` and `compiled` were no plugins, and these were assemblies.
         if content.get("formulation") is None:

@@ -24,7 +24,6 @@ from vibench.stages.artefacts import dumps, loads
 from vibench.testing.case import Arrays, Case, at, difference, differences, largest_entry
 from vibench.testing.checks import Check, Note
 from vibench.testing.sample_problem import sample_reduction
-from vibench.text import shown
 
 
 class Answered(NamedTuple):
@@ -103,9 +102,9 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         """`uses`, `multiplier` and `takes_start` are declared as they should be."""
         plugin, uses = self.plugin, axes_of(self.plugin, type(self.plugin).__name__)
         if not isinstance(plugin.multiplier, Multiplier):
-            yield f"multiplier is {shown(plugin.multiplier)}; expected a vibench.Multiplier"
+            yield f"multiplier is {plugin.multiplier!r}; expected a vibench.Multiplier"
         if not isinstance(plugin.takes_start, bool):
-            yield f"takes_start is {shown(plugin.takes_start)}; expected True or False"
+            yield f"takes_start is {plugin.takes_start!r}; expected True or False"
         yield Note(f"uses {', '.join(uses) or 'no axis'}; λ is {plugin.multiplier}")
 
     def build(self) -> Iterator[str]:

@@ -34,7 +34,6 @@ from vibench.testing.case import (
     unmutated,
 )
 from vibench.testing.checks import Check, ConformanceError, Doubt, Note, plugin_line, raised
-from vibench.text import shown
 from vibench.timing import timed
 
 
@@ -504,7 +503,7 @@ def pictures(case: ProblemCase) -> Iterator[str]:
     mu = training_parameters(case.plugin)[0]
     for name, value in case.plugin.diagnostics(mu.copy()).items():
         if not isinstance(name, str) or not np.isscalar(value) or not np.isfinite(float(value)):  # type: ignore[arg-type]
-            yield f"diagnostics returns {shown(value)} for {shown(name)} {at(mu)}; expected a finite number for a name"
+            yield f"diagnostics returns {value!r} for {name!r} {at(mu)}; expected a finite number for a name"
     solved = active_set.HighFidelitySolver(case.plugin).solve(mu.copy())
     u, lam = solved.u.copy(), solved.lam.copy()
     picture = unmutated("picture", {"u": u, "lam": lam}, lambda: case.plugin.picture(mu.copy(), u, lam))
@@ -545,8 +544,7 @@ def quantities_of_interest(case: ProblemCase) -> Iterator[str]:
         return
     for one in declared:
         if not all(isinstance(text, str) and text.strip() for text in (one.name, one.unit)):
-            named = f"the name {shown(one.name)} and the unit {shown(one.unit)}"
-            yield f"an output has {named}; expected texts, '1' for a number"
+            yield f"an output has the name {one.name!r} and the unit {one.unit!r}; expected texts, '1' for a number"
     names = [one.name for one in declared]
     if len(set(names)) < len(names):
         yield f"two outputs have the same name: {', '.join(map(str, names))}"

@@ -37,7 +37,6 @@ from vibench.stages.enrichment import BuiltEnrichment
 from vibench.testing.case import Arrays, Case, array_fault, at, difference, unmutated
 from vibench.testing.checks import Check, ConformanceError, Doubt, Note, raised
 from vibench.testing.sample_problem import arrays_of, copy_of, sample_offline, sample_snapshots
-from vibench.text import shown
 
 
 @dataclass(eq=False)
@@ -207,7 +206,7 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
         """`build` accepts a tolerance exactly if `takes_tolerance` says so."""
         takes: object = self.plugin.takes_tolerance
         if not isinstance(takes, bool):
-            raise ConformanceError(f"takes_tolerance is {shown(takes)}; expected True or False")
+            raise ConformanceError(f"takes_tolerance is {takes!r}; expected True or False")
         try:
             self.results  # noqa: B018  the first use builds them
         except Exception as error:  # a plugin may raise anything

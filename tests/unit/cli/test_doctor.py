@@ -153,7 +153,9 @@ def test_unusable_places(main: Main, trials: dict[str, Trial], monkeypatch: pyte
     assert "taken/below: cannot be used: Not a directory" in out
     monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
     Store(default_folder()).put("pod-1", "x" * 2**20, NO_TIME, ())
+    (killed := tmp_path / "vibench-1.part").mkdir()
     found = by_subject(list(doctor.check_disk(tmp_path)))
+    assert not killed.exists()
     assert found["stored"].text.startswith("1 artefacts, 1.0 MiB")
     assert "VIBENCH_CACHE" in found["artefact folder"].text
     assert str(tmp_path / "cache" / "artefacts") in found["artefacts"].text

@@ -73,7 +73,7 @@ def test_what_is_right_is_swept(value: str, register: Register, tmp_path: Path) 
 
 def fingerprint_of(create: type[Problem]) -> Fingerprint:
     problem = create()
-    return fingerprint(problem, problem.assemble(problem.training_set()[0]))
+    return fingerprint(problem, mu := problem.training_set()[0], problem.assemble(mu))
 
 
 def test_fingerprints_show_numbering_permutations_and_shapes(
@@ -83,11 +83,11 @@ def test_fingerprints_show_numbering_permutations_and_shapes(
         there = call_in_other_process(fingerprint_of, create, seconds=60.0)
         assert (not list(there.deviations(fingerprint_of(create)))) == same
     wire = Varying()
-    vi = wire.assemble(wire.training_set()[0])
+    vi = wire.assemble(mu := wire.training_set()[0])
     swap = np.arange(wire.V.dim)
     swap[[3, 7]] = swap[[7, 3]]
     other = VariationalInequality(sp.csr_array(vi.A[swap][:, swap]), vi.f, vi.B, vi.g)
-    (text,) = fingerprint(wire, other).deviations(fingerprint(wire, vi))
+    (text,) = fingerprint(wire, mu, other).deviations(fingerprint(wire, mu, vi))
     assert text.endswith("of A differs")
     small, large, nan = (Fingerprint({"g": g}, {"g": 1.0}) for g in (np.ones(2), np.ones(3), np.array([1.0, np.nan])))
     assert list(small.deviations(large)) == ["g has 2 rows against 3"]
@@ -105,11 +105,11 @@ def test_fingerprints_show_numbering_permutations_and_shapes(
 @given(st.sampled_from(["A", "f", "B", "g"]), st.integers(0, 2**16), st.sampled_from([1e-13, 1e-6]))
 def test_a_changed_entry_shows_unless_it_is_round_off(name: str, place: int, size: float) -> None:
     wire = Wire()
-    vi = wire.assemble(np.array([5.0]))
-    before = fingerprint(wire, vi)
+    vi = wire.assemble(mu := np.array([5.0]))
+    before = fingerprint(wire, mu, vi)
     entries = getattr(vi, name).data if sp.issparse(getattr(vi, name)) else getattr(vi, name)
     entries[place % len(entries)] += size * np.max(np.abs(entries))
-    found = list(fingerprint(wire, vi).deviations(before))
+    found = list(fingerprint(wire, mu, vi).deviations(before))
     assert [text.split(" of ")[1] for text in found] == ([f"{name} differs"] if size > 1e-9 else [])
 
 
