@@ -312,8 +312,7 @@ def axes_of(formulation: type[Formulation] | Formulation, title: str) -> tuple[s
     """
     declared = formulation.uses
     if not isinstance(declared, tuple) or not all(one in AXES for one in declared):
-        uses = f"uses = {shown(declared)}"
-        raise RequestError(f"the {title} declares {uses}, expected a tuple of some of {', '.join(AXES)}")
+        raise RequestError(f"the {title} declares uses = {shown(declared)}, expected a tuple of {', '.join(AXES)}")
     # An enrichment enriches V_N, for the generators of a cone.
     if "primal" in declared and not {"pod", "dual"} <= set(declared):
         raise RequestError(f"the {title} declares uses = {shown(declared)}: 'primal' needs 'pod' and 'dual'")

@@ -16,7 +16,6 @@ from vibench.interfaces import strategies, validation
 from vibench.interfaces.formulations import Formulation, Snapshots, axes_of
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import AdaptiveSampling, Cone, DualStrategy, PrimalStrategy, Sampling, Stop
-from vibench.interfaces.validation import ReferenceAssembly, checked_assembly
 from vibench.linalg.inner_product import check_symmetric
 from vibench.model import hyperreduced
 from vibench.model.affine import INTERPOLATION_RTOL, AffineMember, affine_decomposition
@@ -36,7 +35,7 @@ Assembly: TypeAlias = Literal["full", "reduced"]  # of the programs, as in a stu
 
 
 def high_fidelity_sweep(
-    problem: Problem, mus: Array, *, skip: bool = False, reference: ReferenceAssembly | None = None
+    problem: Problem, mus: Array, *, skip: bool = False, reference: validation.ReferenceAssembly | None = None
 ) -> Snapshots:
     """High-fidelity solutions at parameters (P×d); `skip` leaves out those without one, as many as may be skipped.
 
@@ -45,7 +44,7 @@ def high_fidelity_sweep(
     solver, solutions, skipped, solved = HighFidelitySolver(problem), [], [], np.zeros(len(mus), bool)
     for k, mu in enumerate(mus):
         try:
-            vi = checked_assembly(problem, mu)
+            vi = validation.checked_assembly(problem, mu)
             solutions.append(solver.solve_next(mu, vi))
         except NumericalError as error:
             if not skip:
@@ -155,7 +154,7 @@ class Reduction:
     @cached_property
     def snapshots(self) -> Snapshots:
         """High-fidelity solutions at the training parameters; an adaptive sampling strategy chooses these itself."""
-        reference = ReferenceAssembly(self.problem)
+        reference = validation.ReferenceAssembly(self.problem)
         if not isinstance(self.training, AdaptiveSampling):
             mus = validation.training_parameters(self.problem, self.training)
             swept = high_fidelity_sweep(self.problem, mus, skip=self.on_failure == "skip", reference=reference)

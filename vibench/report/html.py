@@ -28,6 +28,7 @@ from vibench.results.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
 from vibench.results.read import in_order, read_table
 from vibench.results.schema import STORED, TABLES
 from vibench.results.selection import short_keys
+from vibench.results.verdict import verdicts
 from vibench.stability.infsup import VANISHES
 from vibench.text import printable
 
@@ -176,10 +177,11 @@ def page(path: Path, *, figures: bool = True) -> str:
     style, script = ((templates / f"report.{end}").read_text(encoding="utf-8").strip() for end in ("css", "js"))
     template = environment("templates", trim_blocks=True, lstrip_blocks=True).get_template("report.html.j2")
     return template.render(
-        study=run.identity["study"] or path.parent.name, facts=list(run.facts), verdicts=run.verdicts,
+        study=run.identity["study"] or path.parent.name, facts=list(run.facts),
+        verdicts=list(verdicts(cells, read["thresholds"])), cells=len(cells),
         standings=leaderboard(cells, paired), criteria=Criterion, largest_band=LARGEST_BAND, way=way,
         vanishes=VANISHES, short=lambda cell: str(cell)[:key_length], findings=list(findings.all_findings(read)),
-        cells=len(cells), failed=int((cells["status"] != Status.OK).sum()),
+        failed=int((cells["status"] != Status.OK).sum()),
         missing=failures + [f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason],
         grids=grids, drawn=figures, images=images, cut=any(len(data.duals) > 1 for data in data_of.values()),
         plots={plot.name: plot for plot in live}, overviews=first_plots,

@@ -129,7 +129,7 @@ def test_seconds_have_changed_where_the_rounds_tell_by_their_interval(changed: C
     assert ((online["ratio_high"] < 2.2) & (online["ratio_high"] > 2.0)).all()
 
 
-def test_what_is_equal_round_off_or_new_is_no_regression(changed: Changed, quick_run: Path, tmp_path: Path) -> None:
+def test_what_is_equal_round_off_or_new_is_no_regression(changed: Changed, tmp_path: Path) -> None:
     """Nor are columns without any value an obstacle."""
     empty = ("UPDATE thresholds SET primal_tol_b = NULL, dual_tol = NULL", "UPDATE cells SET primal_tol = NULL")
     for before, after, changes in (

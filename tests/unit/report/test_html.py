@@ -148,7 +148,7 @@ def test_a_label_is_no_markup_wherever_it_stands(changed: Changed) -> None:
     assert escape(brief(label)) in page
 
 
-def test_pictures_are_of_winners_and_labels_no_models(changed: Changed, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_are_of_winners_and_labels_no_models(changed: Changed) -> None:
     path = changed("UPDATE cells SET error_lambda_mean = 0.05, error_u_mean = 0.01")
     (hertz, _) = leaderboard(in_order(read_table(path, "cells")))
     (winner, *_) = hertz.bands[0].winners

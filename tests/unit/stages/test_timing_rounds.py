@@ -2,7 +2,6 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -79,7 +78,7 @@ def test_every_round_has_every_cell_once_before_the_next_one_begins(rounds: int,
     assert sorted(places) == [(number, k) for number in range(rounds) for k in range(count)]
 
 
-def test_rounds_visit_cells_in_other_orders_and_a_slow_machine_meets_all_alike(tmp_path: Path) -> None:
+def test_rounds_visit_cells_in_other_orders_and_a_slow_machine_meets_all_alike() -> None:
     """Whoever comes after a large model finds its own arrays out of the cache: not always the same one."""
     stage = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 12, 0)
     first = [stage.place(number * 6)[1] for number in range(12)]

@@ -97,7 +97,7 @@ FAULTS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "Restarts": ("nested growth", "the vectors of tolerance 0.5 are not the first ones of tolerance 0.1"),
     },
     "broken_formulations": {
-        "AxisThatIsNone": ("axes", "uses = ('pod', 'cones')", "expected a tuple of some of pod, dual, primal"),
+        "AxisThatIsNone": ("axes", "uses = ('pod', 'cones')", "expected a tuple of pod, dual, primal"),
         "EnrichesNothing": ("axes", "'primal' needs 'pod' and 'dual'"),
         "MultiplierInWords": ("axes", "multiplier is 'somehow'", "vibench.Multiplier"),
         "BuildsAList": ("build", "`build` returned a list, expected a mapping"),

@@ -25,7 +25,6 @@ from cachetools import LRUCache
 from vibench.arrays import Array, Mask, SparseMatrix
 from vibench.errors import at_parameter
 from vibench.highfidelity import active_set
-from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Trainer
@@ -196,7 +195,7 @@ class IncrementalModel:
     (ii) of `vibench.model.error_bounds`, at the cost of the mesh.
     """
 
-    def __init__(self, problem: Problem, solver: HighFidelitySolver) -> None:
+    def __init__(self, problem: Problem, solver: active_set.HighFidelitySolver) -> None:
         self._problem, self._solver = problem, solver
         self._whitened, self._basis = np.zeros((problem.V.dim, 0)), np.zeros((problem.V.dim, 0))
         self.generators = np.zeros((problem.W.dim, 0))
@@ -204,7 +203,7 @@ class IncrementalModel:
         self._last: tuple[bytes, ErrorEstimate] | None = None
         self._state: BoundState | None = None
 
-    def add(self, vi: VariationalInequality, solution: HighFidelitySolution) -> str:
+    def add(self, vi: VariationalInequality, solution: active_set.HighFidelitySolution) -> str:
         """Add the solution of `vi`; returns what was less accurate than usual, "" if nothing."""
         V, W, size = self._problem.V, self._problem.W, self._whitened.shape[1]
         rest, note = subtract_cone_component(solution.lam, self.generators, W)
@@ -296,7 +295,7 @@ class Solved:
     """
 
     mu: Array
-    solution: HighFidelitySolution
+    solution: active_set.HighFidelitySolution
     seconds: Seconds
     bound: float
     evaluated: int
@@ -314,7 +313,7 @@ class GreedyTrainer(Trainer):
     def __init__(self, problem: Problem, reference: ReferenceAssembly) -> None:
         self._problem, self._reference = problem, reference
         # one condensation serves a bound and the solution there
-        self._solver = HighFidelitySolver(problem, condensing=True)
+        self._solver = active_set.HighFidelitySolver(problem, condensing=True)
         self._model, self._evaluated = IncrementalModel(problem, self._solver), 0
         self.solved: list[Solved] = []
         self.setup = self.selecting = NO_TIME

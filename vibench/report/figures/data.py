@@ -39,7 +39,7 @@ class ProblemTables:
         Label of the problem in the study, with that of the training set where the problem has several.
     problem_name, problem_options
         Name of its plugin, and the options that are not at their default.
-    cells, queries, histories, thresholds, outputs
+    cells, queries, histories, thresholds
         Rows of the tables of the results file, in the order of the axes.
     pictures
         Its recorded solutions.
@@ -52,7 +52,6 @@ class ProblemTables:
     queries: pd.DataFrame
     histories: pd.DataFrame
     thresholds: pd.DataFrame
-    outputs: pd.DataFrame
     pictures: tuple[pictures.Shown, ...]
 
     def restrict_to_dual(self, dual: str) -> ProblemTables:
@@ -87,7 +86,7 @@ def problem_tables(
 
     Tables that are `known` are not read again.
     """
-    names = ("cells", "queries", "histories", "thresholds", "outputs")
+    names = ("cells", "queries", "histories", "thresholds")
     read = {name: in_order(known[name] if name in known else read_table(path, name)) for name in names}
     if read["queries"].empty:
         return
