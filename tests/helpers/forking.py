@@ -1,6 +1,6 @@
 """Commands and worker processes, forked from a process with the libraries loaded: imports are most of a short run.
 
-A template process imports the libraries and vibench, and hashes its sources, once for each process of the tests. What
+A template process imports the libraries and vibench, and hashes its sources, once for all processes of the tests. What
 is forked from it has the arguments, folder, environment and path that a new interpreter would get, and imports plugins
 itself. Tests of how processes start and what belongs to them take new interpreters: the fixtures `command` and
 `new_workers`.
@@ -20,7 +20,6 @@ import socket
 import struct
 import subprocess
 import sys
-import tempfile
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -30,6 +29,8 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import walk_packages
 from typing import Any
+
+from template import paths, template
 
 from vibench.execution import supervisor
 
@@ -42,15 +43,11 @@ LOADED = [
 PACKAGES = ("cli", "execution", "plugins", "results", "stages", "study", "testing")
 """Packages of vibench that the template imports with all their modules, and so most others; plugins it does not."""
 
-TESTS = Path(__file__).parents[1]
-
 FILE_KIB = "VIBENCH_TESTS_FILE_KIB"
 """Variable of the environment: the largest file that a forked process and its workers may write, in KiB."""
 
 SUPERVISOR = "VIBENCH_TESTS_SUPERVISOR"
 """Variable of the environment of a forked worker process: the process that watches it, which is not its parent."""
-
-_starting = threading.Lock()
 
 start_new_worker = supervisor.start_worker
 
@@ -136,35 +133,6 @@ def forked(
     return _ended(ForkedCommand(program, folder, file_kib))
 
 
-def template() -> str:
-    """The address of the template process, which ends with this one; threads that ask at once get the same one."""
-    with _starting:
-        return _started()
-
-
-@cache
-def _started() -> str:
-    folder = tempfile.mkdtemp(prefix="vibench-tests-")
-    ours, theirs = socket.socketpair()
-    address = f"{folder}/socket"
-    with theirs:
-        environment = {name: value for name, value in os.environ.items() if name != "VIBENCH_WORKER"}
-        environment |= {"PYTHONPATH": os.pathsep.join(paths()), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        process = subprocess.Popen(
-            [sys.executable, "-P", __file__, str(theirs.fileno()), address], env=environment,
-            pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True,
-        )  # fmt: skip
-    assert ours.recv(1) == b"+"
-    atexit.register(process.wait)
-    atexit.register(ours.close)  # first: the template ends when it is closed
-    return address
-
-
-def paths() -> list[str]:
-    """Where this process finds modules, the tests left out."""
-    return [entry for entry in sys.path if entry and TESTS not in (Path(entry), *Path(entry).parents)]
-
-
 def run_command(
     arguments: Sequence[str], folder: Path, plugins: Path, timeout: float, file_kib: int | None = None
 ) -> subprocess.CompletedProcess[str]:
@@ -209,16 +177,16 @@ def fork_workers(address: Callable[[], str] = template) -> Iterator[None]:
 def main() -> None:
     """Serve requests at an address until the other end of a socket is closed."""
     alive, address = socket.socket(fileno=int(sys.argv[1])), sys.argv[2]
-    _load()
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listener.bind(address)
     listener.listen(64)
+    alive.sendall(b"+")  # who asks now waits until all is loaded
+    _load()
     wake, waking = socket.socketpair()
     for end in (wake, waking):
         end.setblocking(False)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.set_wakeup_fd(waking.fileno(), warn_on_full_buffer=False)
-    alive.sendall(b"+")
     children: dict[int, socket.socket] = {}
     while alive not in (ready := select.select([alive, listener, wake], [], [])[0]):
         if wake in ready:
@@ -240,7 +208,6 @@ def _load() -> None:
     for package in PACKAGES:
         for module in walk_packages(import_module(f"vibench.{package}").__path__, f"vibench.{package}."):
             import_module(module.name)
-    sys.path.append(str(Path(__file__).parent))  # only here: what is forked has a path of its own
     import_module("unsynced").leave_syncing_to_the_system()
     import_module("vibench.execution.supervisor").code_here()
     _hash_stages(import_module("vibench.stages.base").Stage)
