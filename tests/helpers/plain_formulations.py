@@ -15,9 +15,6 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 from scipy.cluster.vq import kmeans2
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
 from vibench import Array, Reduction, Snapshots, VariationalInequality, projected_members
 from vibench.interfaces.formulations import SolveQP
@@ -158,6 +155,10 @@ def radial_regression(offline: Reduction) -> Query:
 
 def gaussian_regression(offline: Reduction) -> Query:
     """A Gaussian process for every coefficient (Guo and Hesthaven 2018); the third answer is the deviation of u."""
+    from sklearn.exceptions import ConvergenceWarning  # noqa: PLC0415  an extra, and slow to import
+    from sklearn.gaussian_process import GaussianProcessRegressor  # noqa: PLC0415
+    from sklearn.gaussian_process.kernels import ConstantKernel, Matern  # noqa: PLC0415
+
     box = offline.problem.parameters
     points = (offline.snapshots.mu - box.lower) / box.widths
     of_u, of_lam, rays = _projected(offline)

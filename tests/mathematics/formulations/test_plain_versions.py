@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-
-pytest.importorskip("sklearn")  # of both versions of `regression`
-
 import plain_formulations as plain
+import pytest
 
 from vibench import FormulationAnswer, HighFidelitySolver, QuerySettings, Reduction, Stop, create
 from vibench.offline.models import CellSolver
@@ -19,6 +16,7 @@ SOLVE = CellSolver("piqp", ACCURACY)
 
 @pytest.fixture(scope="module")
 def discs() -> Reduction:
+    pytest.importorskip("sklearn")  # of both versions of `regression`
     problem = create("problem", "hertz", {"resolution": 300})
     pair = create("dual strategy", "mcpg"), create("primal strategy", "offline-pga")
     return Reduction(problem, *pair, Stop(1e-3), Stop(1e-2), 0.5, assembly="reduced", accuracy=ACCURACY)

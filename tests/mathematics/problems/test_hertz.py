@@ -1,6 +1,7 @@
 """Hertz contact of two discs, at a fixed approach and at one that is a parameter, and its coupling of meshes."""
 
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -102,7 +103,7 @@ def test_contact_beyond_the_zone_and_pairing_beyond_the_disc_are_refused(coarse:
     with pytest.raises(NumericalError, match="the radius of disc 2 is too small"):
         coarse.assemble(np.array([0.6]))
     # From where each flat moves by 0.22 m and more: what Benaceur's grid would be if d were that.
-    solver = HighFidelitySolver(LOADED)
+    solver = HighFidelitySolver(LOADED())
     solver.solve(np.array([1.125, 0.2]))
     with pytest.raises(NumericalError, match=r"at mu = \[1.125, 0.25\]: the contact reaches the end of the potential"):
         solver.solve(np.array([1.125, 0.25]))
@@ -143,41 +144,41 @@ def test_loads_of_multipliers_are_those_of_the_matrix_at_every_radius(options: d
         loads.varying(np.array([0.5, 0.11])[: problem.parameters.dim])
 
 
-LOADED, PAPER = Hertz("coarse", approach="parameter"), Hertz("coarse")
+LOADED, PAPER = cache(partial(Hertz, "coarse", approach="parameter")), cache(partial(Hertz, "coarse"))
 
 
 def test_the_grid_is_that_of_the_total_approach_and_those_of_one_radius_share_supremizers() -> None:
-    training = LOADED.training_set()
+    training = LOADED().training_set()
     assert training.shape == (192, 2)
     assert np.unique(2.0 * training[:, 1].round(12)) == pytest.approx(0.15 + 0.01 * np.arange(16))
     assert np.unique(training[:, 0].round(12)) == pytest.approx(np.linspace(0.905, 1.125, 12))
-    assert LOADED.parameters.names == ("radius", "approach")
-    assert LOADED.validation_set(5, 1).shape == (5, 2)
-    classes = constraint_classes([LOADED.assemble(mu).B for mu in training])
+    assert LOADED().parameters.names == ("radius", "approach")
+    assert LOADED().validation_set(5, 1).shape == (5, 2)
+    classes = constraint_classes([LOADED().assemble(mu).B for mu in training])
     assert len(classes.representatives) == 12
     assert np.array_equal(classes.members, np.repeat(np.arange(12), 16))
 
 
 @pytest.mark.parametrize("radius", [0.905, 1.1])
 def test_the_approach_is_taken_from_the_gap_and_changes_nothing_else(radius: float) -> None:
-    before = PAPER.assemble(np.array([radius]))
+    before = PAPER().assemble(np.array([radius]))
     for approach in (0.075, 0.09, 0.15):
-        vi = LOADED.assemble(np.array([radius, approach]))
+        vi = LOADED().assemble(np.array([radius, approach]))
         assert abs(vi.B - before.B).max() == 0.0
         assert abs(vi.A - before.A).max() == 0.0
         assert not np.any(vi.f)
-        taken = 2.0 * (approach - 0.09) * LOADED.macro_lengths  # both flats move
+        taken = 2.0 * (approach - 0.09) * LOADED().macro_lengths  # both flats move
         assert np.allclose(vi.g, before.g - taken, rtol=1e-13, atol=1e-15)
         assert np.allclose(vi.dirichlet_lift, before.dirichlet_lift * approach / 0.09, rtol=1e-14)
-    assert LOADED.constant == {"A", "f"}
+    assert LOADED().constant == {"A", "f"}
 
 
 def test_at_the_approach_of_the_paper_it_is_the_problem_of_the_paper() -> None:
     mu = np.array([1.05, 0.09])
-    one, two = HighFidelitySolver(LOADED).solve(mu), HighFidelitySolver(PAPER).solve(mu[:1])
+    one, two = HighFidelitySolver(LOADED()).solve(mu), HighFidelitySolver(PAPER()).solve(mu[:1])
     assert np.array_equal(one.u, two.u)
     assert np.array_equal(one.lam, two.lam)
-    assert LOADED.resultants(mu, one.u) == PAPER.resultants(mu[:1], two.u)
+    assert LOADED().resultants(mu, one.u) == PAPER().resultants(mu[:1], two.u)
 
 
 def test_contact_grows_with_the_approach_as_hertz_says() -> None:
@@ -203,7 +204,7 @@ def test_contact_stays_inside_the_zone_over_the_whole_box(options: dict[str, obj
 
 
 def test_members_are_constant_or_left_to_the_contact() -> None:
-    members = affine_decomposition(LOADED, LOADED.training_set()[::5], 1e-6)
+    members = affine_decomposition(LOADED(), LOADED().training_set()[::5], 1e-6)
     assert {name: member.way for name, member in members.items()} == {
         "A": Evaluation.CONSTANT, "f": Evaluation.CONSTANT, "B": Evaluation.CONTACT, "g": Evaluation.CONTACT,
     }  # fmt: skip

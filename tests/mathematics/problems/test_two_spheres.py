@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import scipy.sparse.linalg as sla
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import nnls
 from skfem import Basis, BilinearForm, ElementHex1, ElementQuad2, ElementVector, FacetBasis, MeshHex, MeshQuad
@@ -28,7 +28,6 @@ def spheres(cells: int, extent: float) -> tuple[TwoSpheres, HighFidelitySolver]:
     return one, HighFidelitySolver(one)
 
 
-@settings(max_examples=50)
 @given(
     st.lists(st.floats(0.05, 1.0), min_size=1, max_size=6),
     st.lists(st.floats(0.05, 1.0), min_size=1, max_size=6),

@@ -126,7 +126,6 @@ def test_a_negative_snapshot_is_refused(create: type[DualStrategy]) -> None:
 
 
 @given(families(), st.floats(1e-3, 0.9))
-@settings(max_examples=50)
 def test_angle_greedy_stops_at_the_angle_of_every_single_snapshot(theta: Array, tolerance: float) -> None:
     cone = AngleGreedy().reduce(theta, W, Stop(tolerance=tolerance))
     norms = W.norm(theta)
@@ -176,7 +175,6 @@ def test_the_orthant_takes_the_direction_that_the_farthest_snapshot_lacks_most()
 
 
 @given(families())
-@settings(max_examples=50)
 def test_the_enlarged_cone_contains_that_of_cpg_and_nothing_moves_any_more(theta: Array) -> None:
     given_cone, cone = (s.reduce(theta, W, Stop(size=theta.shape[1])) for s in (CPG(), EnlargedCPG()))
     assert cone.size <= given_cone.size
@@ -247,7 +245,6 @@ def test_a_factorisation_that_was_stopped_is_recorded_and_one_that_misses_its_to
 
 
 @given(families(), st.integers(0, 8))
-@settings(max_examples=50)
 def test_pod_dual_is_free_of_signs_and_no_linear_space_leaves_less_in_the_mean(theta: Array, size: int) -> None:
     cone = PODDual().reduce(theta, W, Stop(size=size))
     assert np.all(cone.free)

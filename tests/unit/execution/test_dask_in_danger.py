@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from distributed import Client
 from running import Vibench, assert_same_numbers, read_until, started
 from samples import wire_study, write_study
 
@@ -147,5 +146,7 @@ def stop(process: subprocess.Popen[bytes]) -> None:
 
 def arrived(address: str) -> int:
     """Number of workers that a scheduler has."""
+    from distributed import Client  # noqa: PLC0415  an import of half a second, in every process that collects tests
+
     with Client(address, timeout="30s", set_as_default=False) as client:
         return len(client.scheduler_info(n_workers=-1)["workers"])

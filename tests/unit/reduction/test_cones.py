@@ -3,7 +3,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numerics import space
 
@@ -75,7 +75,6 @@ def test_projection_meets_its_optimality_conditions(seed: int, factor: float) ->
 
 
 @given(seeds)
-@settings(max_examples=50)
 def test_greedy_errors_fall_and_are_the_largest_distances(seed: int) -> None:
     X, theta = space(8, seed), snapshots(seed)
     largest = float(X.norm(theta).max())

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from samples import cells_of, row_of
 
@@ -98,7 +98,6 @@ some = st.floats(1e-6, 0.49)
 """Numbers below the seconds of a high-fidelity solution, 0.5 in all rows."""
 
 
-@settings(max_examples=50)
 @given(st.lists(st.tuples(some, some, some, st.sampled_from([0.0, 0.3])), min_size=1, max_size=8))
 def test_nobody_in_a_band_is_better_than_its_winner(found: list[tuple[float, float, float, float]]) -> None:
     rows = [
