@@ -22,7 +22,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from running import Main, Vibench, rows
+from running import Main, Register, Vibench, rows
 from samples import ROUNDS, toml
 
 import vibench
@@ -30,7 +30,6 @@ from vibench.cli.main import app
 from vibench.errors import RequestError
 from vibench.execution import run as execution
 from vibench.execution.timing_plan import TimingPlan
-from vibench.plugins import registry
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
 from vibench.results import formats, schema
@@ -85,13 +84,11 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def importable(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def importable(package: Path, register: Register, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(str(package))
     yield
     for name in [name for name in sys.modules if name.split(".")[0] == "vibench_mine"]:
         del sys.modules[name]
-    for known in (registry._readable, registry.registered):
-        known.cache_clear()
 
 
 @pytest.mark.usefixtures("importable")
@@ -223,6 +220,7 @@ def test_the_example_of_the_reference_is_a_study_and_its_rules_are_rules(tmp_pat
         assert str(caught.value) == f"{path}: {refused.strip()}"
 
 
+@pytest.mark.usefixtures("few_rounds")
 @pytest.mark.parametrize(
     ("page", "texts", "written"),
     [

@@ -4,15 +4,13 @@ import os
 import shutil
 import subprocess
 import sys
-import sysconfig
-import venv
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from running import Vibench
 from samples import ROUNDS, write_study
 from sources import SOURCES, mentions
 
@@ -21,8 +19,6 @@ from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "vibench-rope"
-
-Python = Callable[..., "subprocess.CompletedProcess[str]"]
 
 BUILT_IN = ("decorrelated", "online-supremizers", "offline-pga")
 OWN = "fixed-supremizers"
@@ -44,37 +40,26 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def python(example: Path, artefacts: Path) -> Python:
-    """Function that runs the Python of a new environment: what is installed here, and the example."""
-    folder = example.with_name("environment")
-    venv.create(folder, symlinks=True)
-    interpreter = folder / "bin" / "python"
-    site = folder / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
-    here = dict.fromkeys(sysconfig.get_path(name) for name in ("purelib", "platlib"))
-    (site / "here.pth").write_text("".join(f"import site; site.addsitedir({place!r})\n" for place in here))
-
-    def run(*arguments: str, where: Path = example.parent) -> subprocess.CompletedProcess[str]:
-        clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PIP_"))}
-        environment = clean | {"VIBENCH_CACHE": str(artefacts.parent)}
-        command = [str(interpreter), *arguments]
-        done = subprocess.run(command, cwd=where, env=environment, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done
-
-    quietly = ("--quiet", "--disable-pip-version-check", "--no-index", "--no-deps", "--no-build-isolation")
-    run("-m", "pip", "install", *quietly, str(example))
-    return run
+def site(example: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the package is installed, and not its sources but its wheel."""
+    folder = tmp_path_factory.mktemp("site")
+    quietly = ["--quiet", "--disable-pip-version-check", "--no-index", "--no-deps", "--no-build-isolation"]
+    install = [sys.executable, "-m", "pip", "install", *quietly, "--target", str(folder), str(example)]
+    subprocess.run(install, check=True, capture_output=True, text=True)
+    return folder
 
 
 @pytest.fixture(scope="module")
-def cells(python: Python, command: str, example: Path) -> tuple[pd.DataFrame, pd.DataFrame, str]:
-    done = python(command, "run", write_study(example.parent, STUDY), "--jobs", "1", "--strict", "--no-figures")
+def cells(vibench: Vibench, site: Path, example: Path) -> tuple[pd.DataFrame, pd.DataFrame, str]:
+    study = write_study(example.parent, STUDY)
+    done = vibench(example.parent, "run", study, "--jobs", "1", "--strict", plugins=site)
+    assert (done.returncode, done.stderr) == (0, "")
     path = example.parent / "runs" / STUDY["name"] / FILE
     return read_table(path, "cells"), read_table(path, "queries"), done.stdout
 
 
-def test_the_package_is_found_through_its_entry_points_alone(python: Python, command: str) -> None:
-    *cells, last = python(command, "run", "rope", "--dry-run").stdout.splitlines()
+def test_the_package_is_found_through_its_entry_points_alone(vibench: Vibench, site: Path, tmp_path: Path) -> None:
+    *cells, last = vibench(tmp_path, "run", "rope", "--dry-run", plugins=site).stdout.splitlines()
     assert last == "33 cells"
     assert sum(f"· {FORMULATION} ·" in cell for cell in cells) == 1
     assert sum(f" {OWN} " in cell for cell in cells) == 8
@@ -113,7 +98,10 @@ def test_every_cell_has_row_and_line_is_stable(cells: tuple[pd.DataFrame, pd.Dat
     assert (plain["beta_span"].to_numpy() < ours["beta_span"].to_numpy()).any()
 
 
-def test_checks_and_tests_of_the_package_pass_where_installed(python: Python, command: str, example: Path) -> None:
-    assert " passed, 0 failed, 0 skipped" in python(command, "check", FORMULATION).stdout
-    done = python("-m", "pytest", "-p", "no:cacheprovider", where=example)
+def test_checks_and_tests_of_the_package_pass_where_installed(vibench: Vibench, site: Path, example: Path) -> None:
+    assert " passed, 0 failed, 0 skipped" in vibench(example.parent, "check", FORMULATION, plugins=site).stdout
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider"]
+    environment = os.environ | {"PYTHONPATH": str(site)}
+    done = subprocess.run(command, cwd=example, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
     assert " passed" in done.stdout
