@@ -27,11 +27,11 @@ TABLES = ("cells", "thresholds", "disagreements")
 """Tables written beside the page. Those of all queries and histories take megabytes and stay in the run folder."""
 
 FIGURES = {
-    "benefit": ("total-cost", "work-precision", "inf-sup"),
-    "hertz-quadrature": ("solutions", "convergence"),
+    "benefit": ("answer",),
+    "hertz-quadrature": ("answer",),
     "solvers": ("solvers",),
 }
-"""Kinds of figures on the page of a study; all of them on other pages."""
+"""Kinds of figures on the page of a study."""
 
 
 REPEATED = {"benefit": " --repeats 3"} | dict.fromkeys(PAPER, " --repeats 3")
@@ -96,11 +96,10 @@ def outcomes(cells: pd.DataFrame) -> tuple[str, str]:
 
 def drawn(path: Path, folder: Path) -> Iterator[tuple[str, str]]:
     """Draw the figures of the page; returns the name of each, and the picture with its caption."""
-    kinds = FIGURES.get(folder.name, ())
+    kinds = FIGURES.get(folder.name, ("answer", "convergence"))
     with styled():
-        for name, draw, data in figures.drawings(path):
-            figure = draw(data) if not kinds or name.endswith(kinds) else None
-            if figure is not None:
+        for name, draw, data in figures.drawings(figures.problem_tables(path), kinds):
+            if (figure := draw(data)) is not None:
                 file = write_figure(figure, folder, name)
                 yield name, f"![{alternative(figure, name)}]({file.name})\n\n{escaped(caption_of(figure))}"
 

@@ -237,7 +237,7 @@ def draw_figures(
     out: Annotated[Path | None, Option(metavar="DIR", help="Folder; RUN/figures by default.")] = None,
     formats: Annotated[list[FigureFormat] | None, Option("--format", help="Default: png and svg (repeatable).")] = None,
 ) -> None:
-    """Draw the figures of runs, with captions."""
+    """Draw the figures of runs, of all kinds, with captions."""
     from vibench.results.read import results_file
 
     # A run may be named twice: as a folder and by its name.
@@ -250,15 +250,17 @@ def draw_figures(
         raise Exit(1)
 
 
-def draw_run(path: Path, folder: Path, formats: tuple[str, ...] = ("png", "svg")) -> bool:
-    """Draw all figures of a results file, and return whether none failed; Ctrl-C leaves those that are drawn."""
+def draw_run(
+    path: Path, folder: Path, formats: tuple[str, ...] = ("png", "svg"), kinds: tuple[str, ...] | None = None
+) -> bool:
+    """Draw the figures of a results file, and return whether none failed; Ctrl-C leaves those that are drawn."""
     from vibench.library.progress import DrawingDisplay
     from vibench.report import figures
 
     # The run is complete at this point: Ctrl-C costs pictures alone, and says how to get them.
     try:
         with DrawingDisplay() as display:
-            drawn, failures = figures.draw_all(path, folder, formats, display.show)
+            drawn, failures = figures.draw_all(path, folder, formats, display.show, kinds)
     except KeyboardInterrupt:
         missing = f"some figures are missing; `vibench figures {run_argument(path.parent)}` draws them"
         echo(f"interrupted while drawing: results and tables are complete, {missing}")

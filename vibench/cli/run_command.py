@@ -51,7 +51,7 @@ def run_study_command(
     fresh: Annotated[bool, Option("--fresh", help="Remove earlier results and recompute everything.")] = False,
     retry: Annotated[bool, Option("--retry", help="Also rerun cells that did not end ok.")] = False,
     strict: Annotated[bool, Option("--strict", help="Exit with 1 if a cell is neither ok nor unavailable.")] = False,
-    draw: Annotated[bool, Option("--figures/--no-figures", help="Draw the figures at the end.")] = True,
+    draw: Annotated[bool, Option("--figures/--no-figures", help="Draw an answer sheet per problem.")] = True,
     executor: Annotated[Literal["local", "dask"], Option(help="Local processes, or a dask cluster.")] = "local",
     scheduler: Annotated[str | None, Option(metavar="ADDRESS", help="A dask scheduler; a new one by default.")] = None,
 ) -> None:
@@ -125,7 +125,7 @@ def _conclude(outcome: RunResult, folder: Path, *, draw: bool, fresh: bool, stri
         reasons = list(dict.fromkeys(str(row["reason"]) for row in outcome.rows))
         raise VibenchError(f"no cell could run here: {'; '.join(_first(reasons, 'other reasons'))}")
     if draw:
-        draw_run(path, folder / "figures")
+        draw_run(path, folder / "figures", ("png",), ("answer",))
     next_steps(folder, all_ok=set(statuses) == {Status.OK})
     if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
         raise typer.Exit(1)

@@ -140,7 +140,7 @@ class Run:
         return findings(self.path)
 
     def figure(self, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
-        """One figure of the run, to be shown or saved; the kind is "inf-sup", "convergence", "total-cost", ….
+        """One figure of the run, to be shown or saved; the kind is "answer", "convergence", "inf-sup", ….
 
         `problem` and, for figures of a cone, `dual` are labels, not needed where the run has one. Raises a
         `RequestError` if there is no such figure, or the run has no data for it.

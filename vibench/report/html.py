@@ -19,8 +19,8 @@ from vibench.files import write_atomically, writing
 from vibench.qp.status import Status
 from vibench.report import findings, plots
 from vibench.report.differences import ComparedRun
-from vibench.report.figures import FigureTask, figures_of, render
-from vibench.report.figures.data import ProblemTables, label_of, problem_tables, whole
+from vibench.report.figures import drawings, render
+from vibench.report.figures.data import label_of, problem_tables, whole
 from vibench.report.plots import image_of, script_safe, short
 from vibench.results import formats, pictures, ranking, show
 from vibench.results.paired_timing import PairedTiming
@@ -167,12 +167,10 @@ def page(path: Path, *, figures: bool = True) -> str:
     grids = list(_grids({**read, "cells": cells}))
     key_length = short_keys(cells["cell"])
     rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
-    live = [plot for name, data in data_of.items() for plot in plots.plots(name, data, rows)]
     paired = PairedTiming(read["timings"].to_dict("records"))
     certified = ranking.certified_errors(read["queries"])
-    first_plots = [p for name, data in data_of.items() for p in plots.overview(name, data, rows, paired, certified)]
-    tasks = [task for name, data in data_of.items() for task in tasks_of(name, data)] if figures else []
-    images, failures = render(tasks, image_of)
+    live = [plot for name, data in data_of.items() for plot in plots.overview(name, data, rows, paired, certified)]
+    images, failures = render(list(drawings(data_of.items(), ("answer",) if figures else ())), image_of)
     templates = files("vibench.report") / "templates"
     style, script = ((templates / f"report.{end}").read_text(encoding="utf-8").strip() for end in ("css", "js"))
     template = environment("templates", trim_blocks=True, lstrip_blocks=True).get_template("report.html.j2")
@@ -183,12 +181,10 @@ def page(path: Path, *, figures: bool = True) -> str:
         vanishes=VANISHES, short=lambda cell: str(cell)[:key_length], findings=list(findings.all_findings(read)),
         failed=int((cells["status"] != Status.OK).sum()),
         missing=failures + [f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason],
-        grids=grids, drawn=figures, images=images, cut=any(len(data.duals) > 1 for data in data_of.values()),
-        plots={plot.name: plot for plot in live}, overviews=first_plots,
-        plots_alone=[plot for plot in live if plot.name not in {image.name for image in images}],
+        grids=grids, drawn=figures, images=images, plots=live,
         table_data=Markup(script_safe({grid.name: _columnar(grid) for grid in grids})),
-        plot_data=Markup(script_safe({plot.name: plot.data for plot in (*first_plots, *live)})),
-        library=Markup(plots.library()) if live or first_plots else "", style=Markup(style), script=Markup(script),
+        plot_data=Markup(script_safe({plot.name: plot.data for plot in live})),
+        library=Markup(plots.library()) if live else "", style=Markup(style), script=Markup(script),
     )  # fmt: skip
 
 
@@ -201,13 +197,6 @@ def environment(folder: str, **options: Any) -> Environment:
 
     loader = PackageLoader("vibench.report", folder)
     return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, finalize=finalize, **options)
-
-
-def tasks_of(name: str, data: ProblemTables) -> Iterator[FigureTask]:
-    """The figures of a problem on the page, those of a cone for the leading dual strategy alone."""
-    winners = (winner for one in leaderboard(data.cells) for band in one.bands for winner in band.winners)
-    ranked = dict.fromkeys([*filter(None, (str(winner.cell["dual"]) for winner in winners)), *data.duals])
-    return figures_of(name, data, list(ranked)[:1])
 
 
 def way(winner: Winner) -> str:

@@ -17,7 +17,7 @@ import pandas as pd
 from PIL import Image
 
 from vibench.errors import foreign
-from vibench.report.figures.data import ProblemTables, best_solver, label, on_common_queries
+from vibench.report.figures.data import ProblemTables, label
 from vibench.report.figures.style import Look, Looks, Series, caption_of, first_sentence
 from vibench.results import ranking
 from vibench.results.break_even import HIGH_FIDELITY, TAIL
@@ -41,25 +41,18 @@ def library() -> str:
 class Plot:
     """A plot of one problem."""
 
-    name: str  # that of the picture that it replaces
+    name: str
     title: str
     data: dict[str, Any]  # series, points with their rows in the table of cells, panels with coordinates or null
-
-
-def plots(name: str, data: ProblemTables, rows: Mapping[str, int]) -> Iterator[Plot]:
-    """Plots of one problem, whose names begin with `name`; `rows` has the row of every cell in the table of cells."""
-    compared = on_common_queries(best_solver(data.cells), data.queries)
-    shown = compared.cells.assign(online_ms=1e3 * compared.cells["online_s"])
-    solver = f", {shown['solver'].iloc[0]}" if len(shown) else ""
-    errors = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
-    title = f"{data.problem}{solver}: work and precision{compared.over}"
-    yield from _plot(f"{name}-work-precision", title, shown, errors, rows)
 
 
 def overview(
     name: str, data: ProblemTables, rows: Mapping[str, int], paired: PairedTiming, certified: pd.Series
 ) -> Iterator[Plot]:
-    """Errors, and certified ones, of all models against the seconds of a query, and total costs over the queries."""
+    """Errors, and certified ones, of all models against the seconds of a query, and total costs over the queries.
+
+    The name begins with that of the problem; `rows` has the row of every cell in the table of cells.
+    """
     cells = data.cells[ranking.eligible(data.cells) & data.cells["online_s"].notna()]
     if cells.empty:
         return
@@ -116,7 +109,7 @@ def _plot(
             drawn[column] = points
     if not drawn:
         return
-    ways = [Series(*way) for way in zip(cells["primal"], cells["way"], strict=True)]
+    ways = [Series(name, way=way) for name, way in zip(cells["primal"], cells["way"], strict=True)]
     looks, places, duals = Looks(ways), list(dict.fromkeys(ways)), list(dict.fromkeys(cells["dual"]))
     data = {
         "series": [_series(way, looks[way]) for way in places],
@@ -141,7 +134,7 @@ def _series(way: Series, look: Look) -> dict[str, Any]:
         "o": "circle", "s": "square", "^": "triangle", "v": "inverted_triangle", "D": "diamond", "P": "plus",
         "X": "square_x", "*": "star", "d": "diamond_dot", "p": "hex_dot", "h": "hex",
     }  # fmt: skip
-    name = printable(label(way.name, None, str(way.variant)))
+    name = printable(label(way.name, None, way.way))
     return {"name": name, "colour": look.colour, "marker": markers[look.marker], "edge": 1.0 + 1.4 * look.rank}
 
 

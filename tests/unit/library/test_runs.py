@@ -111,7 +111,7 @@ def test_progress_in_a_notebook_is_lines(monkeypatch: pytest.MonkeyPatch, capsys
 
 
 def test_what_a_run_writes(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figures, "KINDS", {"convergence": figures.KINDS["convergence"]})
+    monkeypatch.setattr(figures, "KINDS", {"answer": figures.KINDS["answer"]})
     assert {file.name for file in run.write_tables(tmp_path / "tables")} == set(show.exported_files())
     drawn = run.write_figures(tmp_path / "figures")
     assert {file.suffix for file in drawn} == {".png", ".svg"}

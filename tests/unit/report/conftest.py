@@ -15,7 +15,7 @@ from vibench.results.sqlite import FILE
 
 @pytest.fixture(scope="session")
 def reported(quick_run: Path, shared: Shared) -> Path:
-    """Folder of a real run with its report, with pictures of one problem, drawn once for all workers.
+    """Folder of a real run with its report, made once for all workers.
 
     A strategy has a label that looks like a formula, and the seconds of two cells were measured on a disturbed machine.
     """
@@ -29,10 +29,7 @@ def reported(quick_run: Path, shared: Shared) -> Path:
         folder.mkdir()
         shutil.copy(quick_run / FILE, folder / FILE)
         execute(folder, *labelled, *disturbed)
-        with pytest.MonkeyPatch.context() as patch:
-            tasks_of = html.tasks_of
-            patch.setattr(html, "tasks_of", lambda name, data: tasks_of(name, data) if name == "obstacle" else [])
-            html.write(folder / FILE, folder / "report.html")
+        html.write(folder / FILE, folder / "report.html")
 
     return shared("reported", make)
 

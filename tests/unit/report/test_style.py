@@ -17,7 +17,18 @@ from matplotlib.figure import Figure
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
 from vibench.report.figures.data import file_names
-from vibench.report.figures.style import COLOURS, Looks, Series, Sheet, caption_of, look_of, plot, styled, write_figure
+from vibench.report.figures.style import (
+    COLOURS,
+    Layout,
+    Looks,
+    Series,
+    Sheet,
+    caption_of,
+    look_of,
+    plot,
+    styled,
+    write_figure,
+)
 from vibench.text import printable
 
 SOLVERS = ("piqp", "proxqp", "osqp", "clarabel", "daqp", "quadprog", "highs", "scs", "cvxopt", "ecos")
@@ -82,20 +93,42 @@ NAMES = st.lists(st.text(max_size=12), min_size=1, max_size=10, unique=True)
 
 
 @given(NAMES, NAMES)
-def test_a_strategy_looks_the_same_in_every_figure_of_every_run(one: list[str], other: list[str]) -> None:
+def test_a_strategy_looks_the_same_in_every_figure_where_no_other_has_its_colour(
+    one: list[str], other: list[str]
+) -> None:
     """Whatever else a run compares, in whatever order, and at whatever tolerances."""
     alone, among = Looks([Series(one[0])]), Looks([Series(name, 0.5) for name in [*reversed(other), one[0]]])
     first, second = alone[Series(one[0])], among[Series(one[0], 0.5)]
-    assert (first.colour, first.marker) == (second.colour, second.marker)
+    rivals = {look_of(name).colour for name in other if name != one[0]}
+    assert first.colour in rivals or (first.colour, first.marker) == (second.colour, second.marker)
+
+
+@given(st.lists(st.text(max_size=12), min_size=2, max_size=20, unique=True))
+def test_up_to_eight_names_of_a_figure_have_eight_colours_and_more_have_markers(names: list[str]) -> None:
+    looks = Looks(map(Series, names))
+    found = [(looks[Series(name)].colour, looks[Series(name)].marker) for name in names]
+    assert len(set(found)) == len(names)
+    assert len({colour for colour, _ in found}) == min(len(names), len(COLOURS))
+
+
+def test_line_styles_mean_the_assembly() -> None:
+    ways = ("", "reduced", "reduced with bounds", "compiled", "corrected")
+    looks = Looks([Series(name, tolerance, way) for name in "ab" for tolerance in ("", 0.1) for way in ways])
+    of = {way: {str(looks[Series(n, t, way)].dashes) for n in "ab" for t in ("", 0.1)} for way in ways}
+    assert all(len(styles) == 1 for styles in of.values())
+    assert len({*map(str, of.values())}) == len(ways)
+    assert of[""] == {"-"}
 
 
 @given(NAMES, st.lists(st.floats(0.0, 1.0), max_size=6, unique=True))
 def test_no_two_series_of_a_figure_look_the_same(names: list[str], tolerances: list[float]) -> None:
-    series = [Series(name, variant) for name in names for variant in ("", "reduced", *tolerances)][:10]
+    series = [Series(name, variant, way) for name in names for variant in ("", *tolerances) for way in ("", "reduced")][
+        :10
+    ]
     looks = Looks(series)
     assert len({looks[one] for one in series}) == len(series)
     lines = [looks[one].line(9) for one in series]
-    keys = ("color", "marker", "linestyle", "markerfacecolor")
+    keys = ("color", "marker", "linestyle", "markerfacecolor", "markeredgewidth")
     assert len({tuple(str(line[key]) for key in keys) for line in lines}) == len(series)
 
 
@@ -105,6 +138,22 @@ def test_what_is_shipped_has_colours_and_markers_of_its_own() -> None:
         assert len(set(looks)) == len(looks)
         if len(names) <= len(COLOURS):
             assert len({look.colour for look in looks}) == len(looks)
+
+
+def test_names_beside_the_ends_of_lines_do_not_overlap_nor_leave_the_panel() -> None:
+    sheet = Sheet(1, 1, layout=Layout(1.9, 1.7, "every"))
+    (panel,) = sheet.panels
+    names = ["high-fidelity", "online-supremizers", "offline-pga", "decorrelated", "a strategy, reduced with bounds"]
+    for name in names:
+        plot(panel, [1.0, 2.0], [1.0, 1.0], look_of(name), name)
+    sheet.label_ends(panel)
+    figure = sheet.finish()
+    assert not figure.legends
+    assert [text.get_text().replace("\n", " ").replace("- ", "-") for text in panel.texts] == names
+    boxes = [text.get_window_extent(RendererAgg(10, 10, figure.dpi)) for text in panel.texts]
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+    width, height = figure.get_size_inches() * figure.dpi
+    assert all(0 <= box.x0 <= box.x1 <= width + 1 and 0 <= box.y0 <= box.y1 <= height for box in boxes)
 
 
 LINEAR_TO_XYZ = np.array(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,8 +15,10 @@ from vibench.text import json_object
 with foreign("matplotlib"):
     from matplotlib.figure import Figure
 
-    from vibench.report.figures.costs import solvers, total_cost, work_precision
+    from vibench.report.figures.answer_sheet import answer
     from vibench.report.figures.data import ProblemTables, file_names, problem_tables
+    from vibench.report.figures.effectivity import bounds
+    from vibench.report.figures.qp_solvers import solvers
     from vibench.report.figures.solutions import solutions
     from vibench.report.figures.spaces import convergence, inf_sup
     from vibench.report.figures.style import CaptionedFigure, caption_of, save, styled
@@ -25,8 +27,8 @@ Draw = Callable[[ProblemTables], CaptionedFigure | None]
 
 # Figures by the end of their file names, and whether every dual strategy of a problem has one.
 KINDS: dict[str, tuple[Draw, bool]] = {
-    "solutions": (solutions, False), "convergence": (convergence, False), "work-precision": (work_precision, False),
-    "solvers": (solvers, False), "total-cost": (total_cost, False), "inf-sup": (inf_sup, True),
+    "answer": (answer, False), "solutions": (solutions, False), "convergence": (convergence, False),
+    "bounds": (bounds, False), "solvers": (solvers, False), "inf-sup": (inf_sup, True),
 }  # fmt: skip
 
 # A figure to be drawn: name of its file, function that draws it, and its data.
@@ -35,19 +37,15 @@ Made = TypeVar("Made")
 Progress = Callable[[str, int, int], None]
 
 
-def drawings(path: Path) -> Iterator[FigureTask]:
-    """Every figure a results file may have."""
-    for name, data in problem_tables(path):
-        yield from figures_of(name, data, data.duals)
-
-
-def figures_of(name: str, data: ProblemTables, duals: Collection[str]) -> Iterator[FigureTask]:
-    """The figures of a problem, whose names begin with its name, and of some of its dual strategies."""
-    yield from ((f"{name}-{kind}", draw, data) for kind, (draw, of_dual) in KINDS.items() if not of_dual)
-    for dual, file in zip(data.duals, file_names(data.duals), strict=True):
-        if dual in duals:
+def drawings(problems: Iterable[tuple[str, ProblemTables]], kinds: Collection[str]) -> Iterator[FigureTask]:
+    """Every figure of some kinds that problems may have; names begin with that of their problem."""
+    for name, data in problems:
+        chosen = {kind: KINDS[kind] for kind in KINDS if kind in kinds}
+        yield from ((f"{name}-{kind}", draw, data) for kind, (draw, of_dual) in chosen.items() if not of_dual)
+        of_duals = {kind: draw for kind, (draw, of_dual) in chosen.items() if of_dual}
+        for dual, file in zip(data.duals, file_names(data.duals), strict=True) if of_duals else ():
             of_cone = data.restrict_to_dual(dual)
-            yield from ((f"{name}-{file}-{kind}", draw, of_cone) for kind, (draw, of_dual) in KINDS.items() if of_dual)
+            yield from ((f"{name}-{file}-{kind}", draw, of_cone) for kind, draw in of_duals.items())
 
 
 def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
@@ -103,9 +101,13 @@ def read_captions(folder: Path) -> dict[str, str]:
 
 
 def draw_all(
-    path: Path, folder: Path, formats: tuple[str, ...], progress: Progress = lambda *_: None
+    path: Path,
+    folder: Path,
+    formats: tuple[str, ...],
+    progress: Progress = lambda *_: None,
+    kinds: Collection[str] | None = None,
 ) -> tuple[list[Path], list[str]]:
-    """Draw every figure that a results file has data for, in every format.
+    """Draw every figure that a results file has data for, or those of some kinds, in every format.
 
     Returns the files written to the folder, and a line for every figure that could not be drawn. Beside them is
     `captions.json`, with the caption of every figure by the name of its files.
@@ -118,7 +120,7 @@ def draw_all(
         folder.mkdir(parents=True, exist_ok=True)
         return name, caption_of(figure), save(figure, folder, name, formats)
 
-    made, failures = render(list(drawings(path)), write, progress)
+    made, failures = render(list(drawings(problem_tables(path), KINDS if kinds is None else kinds)), write, progress)
     if made:
         captions = read_captions(folder) | {name: caption for name, caption, _ in made}
         text = json.dumps(captions, ensure_ascii=False, indent=1) + "\n"

@@ -166,10 +166,10 @@ def _plugin_name(cells: pd.DataFrame, axis: str) -> str:
     return ""
 
 
-def leading(panels: Sequence[Panel], most: int) -> tuple[Sequence[Panel], str]:
-    """The panels that a figure has room for, and a sentence on the others, "" where there are none."""
+def leading(panels: Sequence[Panel], most: int, noun: str = "panels") -> tuple[Sequence[Panel], str]:
+    """The panels, or curves, that a figure has room for, and a sentence on the others, "" where there are none."""
     left_out = len(panels) - most
-    return panels[:most], f"The tables have the other {left_out} panels." if left_out > 0 else ""
+    return panels[:most], f"The tables have the other {left_out} {noun}." if left_out > 0 else ""
 
 
 def dimensions(rows: pd.DataFrame) -> str:
@@ -197,14 +197,13 @@ def way(assembly: Any, bounds: Any, correction: Any) -> str:
 
 def series(name: Any, tolerance: Any = None, way: str = "") -> Series:
     """Legend key: primal strategy with tolerance, assembly and correction."""
-    variant = "" if pd.isna(tolerance) else float(tolerance)
-    return Series(str(name), f"{way} {variant}" if way else variant)
+    return Series(str(name), "" if pd.isna(tolerance) else float(tolerance), way)
 
 
 def parts(items: list[Any], *, beside_reference: bool = False) -> list[list[Any]]:
-    """Series in groups of about the same size, for panels of at most ten series."""
-    # One of the ten may be the series of the high-fidelity model.
-    most = 9 if beside_reference else 10
+    """Series in groups of about the same size, for panels of at most four series."""
+    # One of the four may be the series of the high-fidelity model.
+    most = 3 if beside_reference else 4
     count = -(-len(items) // most)
     ends = [round(k * len(items) / count) for k in range(count + 1)] if count else []
     return [items[a:b] for a, b in pairwise(ends)]

@@ -14,6 +14,7 @@ from vibench.arrays import Array
 from vibench.interfaces.outputs import Picture
 from vibench.report.figures.data import ProblemTables
 from vibench.report.figures.style import COLOURS, CaptionedFigure, Layout, Sheet
+from vibench.results.pictures import Shown
 
 Limits = tuple[float, float]
 
@@ -46,6 +47,16 @@ def draw_solutions(title: str, shown: Sequence[tuple[str, Picture]]) -> Captione
         "the same range at all parameters. The orange line is the boundary of the contact, where the multiplier "
         "becomes zero."
     )
+
+
+def draw_alone(axes: Axes, shown: Shown) -> str:
+    """Draw the recorded solution of one parameter in a panel; returns what the panel shows, a sentence."""
+    picture = shown.picture
+    assert picture is not None
+    draw_field(axes, picture, _range([picture.values]))
+    name_axes(axes, picture.length_unit, [picture.points])
+    axes.set_title(shown.title, fontsize=8)
+    return f"Upper left, {picture.name} of the full model at {shown.title}; orange is the boundary of the contact."
 
 
 def draw_field(axes: Axes, picture: Picture, limits: Limits, *, bar: bool = True) -> None:

@@ -13,6 +13,7 @@ from vibench.interfaces.strategies import Kind
 from vibench.report.figures import style
 from vibench.report.figures.data import ProblemTables, by_strategy, dimensions, leading, parts, titled_parts
 from vibench.report.figures.style import CaptionedFigure, Looks, Series, Sheet, counted, plot, positive
+from vibench.results.schema import Row
 from vibench.stability.infsup import VANISHES
 
 
@@ -22,15 +23,15 @@ def convergence(data: ProblemTables) -> CaptionedFigure:
     Enrichments are those of the first cone at its tightest tolerances.
     """
     errors = data.histories[data.histories["quantity"] == "error"]
-    # Nobody tells more than ten curves of a panel apart.
-    cones = [(str(dual), rows) for dual, rows in longest(errors[errors["stage"] == "cone"])][:10]
+    # Nobody tells more than four curves of a panel apart.
+    cones, part = leading([(str(dual), rows) for dual, rows in longest(errors[errors["stage"] == "cone"])], 4, "cones")
     fixed = data.queries.loc[data.queries["enrichment_kind"] == Kind.FIXED, "primal"]
     grown = data.histories[(data.histories["stage"] == "enrichment") & data.histories["primal"].isin(set(fixed))]
     grown = grown[grown["dual"] == grown["dual"].iloc[0]] if len(grown) else grown
     # The strategies at the tolerances with the most vectors.
-    most = [rows for _, rows in longest(grown[grown["quantity"] == "beta_span_min"], "primal")][:10]
+    most = [rows for _, rows in longest(grown[grown["quantity"] == "beta_span_min"], "primal")][:4]
     steps = grown[grown["artefact"].isin({name for rows in most for name in rows["artefact"]})]
-    looks = Looks(key for _, key, _ in by_strategy(steps))
+    looks = Looks([*(Series(dual) for dual, _ in cones), *(key for _, key, _ in by_strategy(steps))])
     sheet = Sheet(2 if most else 1, 2, f"{data.problem}: convergence over the training set")
     pod, cone, *others = sheet.panels
     for _, rows in longest(errors[errors["stage"] == "pod"]):
@@ -40,7 +41,7 @@ def convergence(data: ProblemTables) -> CaptionedFigure:
     pod.set(xlabel="number of modes N", ylabel="relative error of the POD", title="primal", yscale="log")
     counted(pod)
     cone.set(title="dual")
-    _cones(cone, cones)
+    _cones(cone, cones, looks)
     quantities = (("sigma", "largest σ"), ("beta_span_min", "min β over span"))
     for panel, (quantity, label) in zip(others, quantities, strict=False):
         for name, key, rows in by_strategy(steps[steps["quantity"] == quantity]):
@@ -53,7 +54,8 @@ def convergence(data: ProblemTables) -> CaptionedFigure:
         f"Convergence of {data.problem} over the training set: the relative tail of the POD against the number N of "
         "modes; the largest relative distance of a multiplier from the cone of the first R generators, for every dual "
         "strategy; and, for fixed enrichments of the first cone, the largest σ, where a strategy reports it, and the "
-        "smallest β over the span against the number of vectors added. Each curve is that of the tightest tolerance."
+        "smallest β over the span against the number of vectors added. Each curve is that of the tightest tolerance.",
+        part,
     )
 
 
@@ -62,13 +64,12 @@ def cone_errors(title: str, steps: pd.DataFrame) -> CaptionedFigure:
     groups = parts([(str(dual), rows) for dual, rows in steps.groupby("dual")])
     sheet = Sheet.with_panels(len(groups), f"{title}: projection errors of the multipliers", share="all")
     for panel, group in zip(sheet.panels, groups, strict=False):
-        _cones(panel, group)
+        _cones(panel, group, Looks(Series(dual) for dual, _ in group))
     distance = f"Largest relative distance of a multiplier of {title} from the cone of the first R generators"
     return sheet.finish(f"{distance}, for every dual strategy.")
 
 
-def _cones(panel: Axes, cones: Sequence[tuple[str, pd.DataFrame]]) -> None:
-    looks = Looks(Series(dual) for dual, _ in cones)
+def _cones(panel: Axes, cones: Sequence[tuple[str, pd.DataFrame]], looks: Looks) -> None:
     for dual, steps in cones:
         plot(panel, steps["step"], positive(steps["value"], 0.0), looks[Series(dual)], dual)
     panel.set(xlabel="number of generators R", ylabel="largest relative error of the cone", yscale="log")
@@ -77,23 +78,17 @@ def _cones(panel: Axes, cones: Sequence[tuple[str, pd.DataFrame]]) -> None:
 
 def inf_sup(data: ProblemTables) -> CaptionedFigure | None:
     """Inf-sup constants β of every primal strategy and of the high-fidelity pair over the validation set."""
-    # Without the other columns: a run may have thousands of pairs, each with a copy of its rows.
-    needed = ["pair", "query", "cell", "mu_1", "enrichment_kind", "primal", "primal_tol"]
-    needed += [name for name in data.queries if name.startswith("beta_")]
-    # Inf-sup constants depend on no solver, assembly or correction.
-    rows = data.queries[needed].drop_duplicates(["pair", "primal", "primal_tol", "query"])
-    constants = rows.iloc[np.argsort(rows.groupby(["pair"], sort=False).ngroup(), kind="stable")]
+    constants = _constants(data.queries)
     shown, axis = loosest(constants), data.parameter
-    panels, part = leading(list(_panels(data, shown)), 4)
+    panels, part = leading(list(_panels(data, shown)), 2)
     if not panels:
         return None
     sheet, over, below = style.two_rows(len(panels), f"{data.problem}, {data.duals[0]}: inf-sup constants")
     looks = Looks(key for _, strategies, _, _ in panels for _, key, _ in strategies)
     zeros: list[list[str]] = []
     for (title, strategies, first, order), span, cone in zip(panels, over, below, strict=True):
-        reference, both = first.set_index("query").reindex(order), (span, cone)
-        # Without a single parameter the abscissae are places in the order.
-        x = reference["mu_1"].to_numpy(float) if axis else np.arange(1, len(reference) + 1)
+        both = (span, cone)
+        reference, x = _along(data, first, order, both)
         _draw_constants(both, x, reference, "beta_hf_", style.HIGH_FIDELITY_LOOK, "high-fidelity")
         drawn = {
             name: _draw_constants(both, x, rows.set_index("query").reindex(order), "beta_", looks[key], name)
@@ -102,11 +97,61 @@ def inf_sup(data: ProblemTables) -> CaptionedFigure | None:
         zeros.append([name for name, zero in drawn.items() if zero])
         span.set_title(title)
         for axes, generated in ((span, "span"), (cone, "cone")):
-            axes.set(ylabel=f"β over {generated}", xlabel=axis or "validation parameters, sorted", yscale="log")
-            if not axis:
-                counted(axes)
+            axes.set(ylabel=f"β over {generated}", yscale="log")
     _name_zeros(over, zeros)
     return sheet.finish(_caption(data, constants, shown, bool(axis)), part)
+
+
+def draw_stability(panel: Axes, data: ProblemTables, best: Row, names: Sequence[str], looks: Looks) -> str:
+    """Draw β over the span at the pair of a cell, of the high-fidelity model and of some strategies.
+
+    Returns what the panel shows, a sentence; "" where there are no constants.
+    """
+    mine = data.queries[(data.queries["dual"] == best["dual"]) & (data.queries["pair"] == best["pair"])]
+    rows = _constants(mine)
+    rows = loosest(rows[rows["primal"].isin(names) & rows["beta_hf_span"].notna()])
+    strategies = list(by_strategy(rows))
+    if not strategies:
+        return ""
+    sorting = next((of for _, _, of in strategies if (of["enrichment_kind"] == Kind.FIXED).any()), strategies[0][2])
+    reference, x = _along(data, sorting, sorting.sort_values(_order(data), kind="stable")["query"], (panel,))
+    _draw_constants((panel,), x, reference, "beta_hf_", style.HIGH_FIDELITY_LOOK, "high-fidelity")
+    zeros = []
+    for _, key, of in strategies:
+        here = of.set_index("query").reindex(reference.index)
+        if _draw_constants((panel,), x, here, "beta_", looks[Series(key.name)], key.name):
+            zeros.append(key.name)
+    panel.set(ylabel="β over span", yscale="log")
+    _name_zeros([panel], [zeros])
+    return (
+        f"Upper right, inf-sup constants over the span of the {dimensions(mine)} pair of {best['dual']} at the "
+        "validation parameters; an answer for λ is stable where the constant is near that of the full model."
+    )
+
+
+def _constants(queries: pd.DataFrame) -> pd.DataFrame:
+    """The inf-sup constants of queries, pair by pair; they depend on no solver, assembly or correction."""
+    # Without the other columns: a run may have thousands of pairs, each with a copy of its rows.
+    needed = ["pair", "query", "cell", "mu_1", "enrichment_kind", "primal", "primal_tol"]
+    needed += [name for name in queries if name.startswith("beta_")]
+    rows = queries[needed].drop_duplicates(["pair", "primal", "primal_tol", "query"])
+    return rows.iloc[np.argsort(rows.groupby(["pair"], sort=False).ngroup(), kind="stable")]
+
+
+def _order(data: ProblemTables) -> str:
+    """The column that validation parameters are sorted by."""
+    return "mu_1" if data.parameter else "beta_span"
+
+
+def _along(data: ProblemTables, rows: pd.DataFrame, order: pd.Series, panels: Sequence[Axes]) -> tuple[Any, Any]:
+    """The rows of a cell in the order of the queries, and their abscissae; names the axis of the panels."""
+    reference, axis = rows.set_index("query").reindex(order), data.parameter
+    for panel in panels:
+        panel.set(xlabel=axis or "validation parameters, sorted")
+        if not axis:
+            counted(panel)
+    # Without a single parameter the abscissae are places in the order.
+    return reference, reference["mu_1"].to_numpy(float) if axis else np.arange(1, len(reference) + 1)
 
 
 def loosest(constants: pd.DataFrame) -> pd.DataFrame:
@@ -139,23 +184,24 @@ def _panels(data: ProblemTables, shown: pd.DataFrame) -> Iterator[tuple[str, lis
         fixed = rows[rows["enrichment_kind"] == Kind.FIXED]
         sorting = fixed if len(fixed) else rows
         first = sorting[sorting["cell"] == sorting["cell"].iloc[0]]
-        order = first.sort_values("mu_1" if data.parameter else "beta_span", kind="stable")["query"]
+        order = first.sort_values(_order(data), kind="stable")["query"]
         strategies = list(by_strategy(rows))
         groups = titled_parts(dimensions(sizes), strategies, beside_reference=True)
         yield from ((title, group, strategies[0][2], order) for title, group in groups)
 
 
-def _draw_constants(
-    axes: tuple[Axes, Axes], x: Any, rows: pd.DataFrame, prefix: str, look: style.Look, name: str
-) -> bool:
-    """Constants over the span, and the interval over the cone as its upper end with a band; whether β is 0 there."""
-    top, below = axes
+def _draw_constants(axes: Sequence[Axes], x: Any, rows: pd.DataFrame, prefix: str, look: style.Look, name: str) -> bool:
+    """Constants over the span, and in a second panel the interval over the cone with its upper end.
+
+    Returns whether β is zero over the span.
+    """
     span = rows[f"{prefix}span"].to_numpy(float)
     finite = span[np.isfinite(span)]
-    plot(top, x, positive(span, VANISHES), look, name)
+    plot(axes[0], x, positive(span, VANISHES), look, name)
     lower, upper = rows[f"{prefix}cone_lower"].to_numpy(float), rows[f"{prefix}cone_upper"].to_numpy(float)
-    plot(below, x, positive(upper, VANISHES), look)
-    below.fill_between(x, lower, upper, color=look.colour, alpha=0.2, linewidth=0.0)
+    for below in axes[1:]:
+        plot(below, x, positive(upper, VANISHES), look)
+        below.fill_between(x, lower, upper, color=look.colour, alpha=0.2, linewidth=0.0)
     return bool(finite.size and finite.max() < VANISHES)
 
 

@@ -8,10 +8,11 @@ import re
 import textwrap
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, NamedTuple
 
@@ -28,77 +29,107 @@ from vibench.text import printable
 # Equidistant in lightness (CIELAB, 22 to 78 in steps of 8), so that grey print keeps them apart, with the hues that are
 # farthest apart for readers with and without a colour vision deficiency; markers differ, too.
 COLOURS = ("#520186", "#91071B", "#A22174", "#615CDB", "#DF5225", "#2CA980", "#AEA0F2", "#E4BD20")
+# Triangles to the left and to the right are missing: they mark break-evens.
+MARKERS = "os^vDPX*dph"
 
 Share = Literal["none", "all", "row", "col"]
 
 
 @dataclass(frozen=True)
 class Look:
-    """Colour and marker of a series, and its rank among the series of a figure that share these.
+    """Colour and marker of a strategy or solver, the line style of its assembly, and a rank among those that share all.
 
-    The name of the strategy or solver determines colour and marker; the rank sets line style and filling.
+    The rank, that of a tolerance, sets filling and width.
     """
 
     colour: str
     marker: str
-    rank: int
+    rank: int = 0
+    dashes: Any = "-"
 
     def line(self, count: int) -> dict[str, Any]:
         """Arguments of `Axes.plot` for a line of `count` points."""
-        dashes = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
         # About nine markers identify a line in grey print; their offset keeps those of equal curves apart.
         every = (self.rank % 3, max(1, count // 9))
-        return {"linestyle": dashes[self.rank % len(dashes)], "markevery": every, **self._marker(3.5)}
+        return {"linestyle": self.dashes, "markevery": every, **self._marker(3.5)}
 
     def point(self) -> dict[str, Any]:
-        """Arguments of `Axes.plot` for points without a line, which only filling and edge distinguish."""
-        return {"linestyle": "none", "markeredgewidth": 1.0 + 0.6 * (self.rank // 3), **self._marker(5.0)}
+        """Arguments of `Axes.plot` for points without a line."""
+        return {"linestyle": "none", **self._marker(5.0)}
 
     def _marker(self, size: float) -> dict[str, Any]:
-        face = (self.colour, "white", "0.75")[self.rank % 3]
-        return {"color": self.colour, "marker": self.marker, "markersize": size, "markerfacecolor": face}
+        face, edge = (self.colour, "white", "0.75")[self.rank % 3], 1.0 + 0.6 * (self.rank // 3)
+        return {"color": self.colour, "marker": self.marker, "markersize": size, "markerfacecolor": face,
+                "markeredgewidth": edge}  # fmt: skip
 
 
-# Dotted black lines.
-HIGH_FIDELITY_LOOK = Look("#000000", "s", 3)
+HIGH_FIDELITY_LOOK = Look("#000000", "s")
 
 
 class Series(NamedTuple):
-    """A series of a figure: the name of its strategy or solver, and the variant of it, such as a tolerance."""
+    """A series of a figure: name of its strategy or solver, variant such as a tolerance, and `way` of its queries."""
 
     name: str
     variant: str | float = ""
+    way: str = ""
 
 
 def look_of(name: str) -> Look:
-    """The look of a strategy or a solver; it depends on the name alone."""
+    """The look that the name of a strategy or a solver determines; figures change it where two of theirs collide."""
     # With this salt the shipped dual strategies have colours of their own, the primal ones, too, and no two of these
     # and of the solvers look the same.
     salt = (120727).to_bytes(8, "big")
     number = int.from_bytes(hashlib.blake2b(name.encode(errors="replace"), digest_size=8, salt=salt).digest(), "big")
-    # Triangles to the left and to the right are missing: they mark break-evens.
-    markers = "os^vDPX*dph"
-    return Look(COLOURS[number % len(COLOURS)], markers[number // len(COLOURS) % len(markers)], 0)
+    return Look(COLOURS[number % len(COLOURS)], MARKERS[number // len(COLOURS) % len(MARKERS)])
+
+
+def _looks_of(names: Iterable[str]) -> dict[str, Look]:
+    """Looks of the names of one figure: up to eight have eight colours, others differ in their markers."""
+    wanted = {name: look_of(name) for name in sorted(set(names))}
+    looks: dict[str, Look] = {}
+    # Names whose colour is free keep it; the others take those that are left.
+    for name, look in wanted.items():
+        if look.colour not in {one.colour for one in looks.values()}:
+            looks[name] = look
+    for name, look in wanted.items():
+        if name not in looks:
+            taken = {(one.colour, one.marker) for one in looks.values()}
+            free = [colour for colour in COLOURS if colour not in {colour for colour, _ in taken}]
+            rest = (pair for pair in product(COLOURS, MARKERS) if pair not in taken)
+            colour, marker = (free[0], look.marker) if free else next(rest, (look.colour, look.marker))
+            looks[name] = Look(colour, marker)
+    return looks
 
 
 class Looks:
-    """The looks of the series of one figure.
+    """The looks of the series of one figure, of which no two are the same.
 
-    Series that share colour and marker, such as one strategy at several tolerances, get ranks in their order, so that
-    no two series of a figure look the same.
+    Names have colours and markers, ways of a query have line styles: full assembly solid, any other way dashed. Series
+    that share all three, one strategy at several tolerances, get ranks in their order.
     """
 
     def __init__(self, series: Iterable[Series]) -> None:
-        alike: dict[Look, list[Series]] = defaultdict(list)
+        given = list(dict.fromkeys(series))
+        looks, alike = _looks_of(one.name for one in given), defaultdict[Look, list[Series]](list)
+        ways = list(dict.fromkeys(sorted(one.way for one in given)))
+        dashes = {way: _dashes(way, ways) for way in ways}
         # Texts come before numbers.
-        numbers = {one: one.variant if isinstance(one.variant, float) else None for one in series}
+        numbers = {one: one.variant if isinstance(one.variant, float) else None for one in given}
         order = {one: (one.name, n is not None, n or 0.0, str(one.variant)) for one, n in numbers.items()}
         for one in sorted(order, key=order.__getitem__):
-            alike[look_of(one.name)].append(one)
+            alike[replace(looks[one.name], dashes=dashes[one.way])].append(one)
         self._known = {one: replace(look, rank=rank) for look, group in alike.items() for rank, one in enumerate(group)}
 
     def __getitem__(self, series: Series) -> Look:
         return self._known[series]
+
+
+def _dashes(way: str, ways: Sequence[str]) -> Any:
+    """The line style of a way of a query among those of a figure."""
+    usual = {"": "-", "reduced": "--", "reduced with bounds": "-."}
+    others = [other for other in ways if other not in usual]
+    more = (":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (1, 3)))
+    return usual[way] if way in usual else more[others.index(way) % len(more)]
 
 
 @dataclass(frozen=True)
@@ -168,6 +199,7 @@ class Sheet:
         made = self.figure.subplots(rows, columns, squeeze=False, sharex=sharex, sharey=sharey)
         self.panels: list[Axes] = list(made.ravel())
         self._labels: dict[int, list[tuple[float, float, str]]] = {}
+        self._labelled_ends: list[Axes] = []
         for panel in self.panels:
             # Every panel has numbers, whether it shares its axes or not.
             panel.tick_params(labelbottom=True, labelleft=True)
@@ -188,6 +220,10 @@ class Sheet:
     def label(self, panel: Axes, x: float, y: float, text: str) -> None:
         """Write a text at a point, where there is room for it in the finished figure; without one keep it clear."""
         self._labels.setdefault(self.panels.index(panel), []).append((x, y, text))
+
+    def label_ends(self, panel: Axes) -> None:
+        """Name the lines of a panel beside their right ends, at most five, in place of the legend."""
+        self._labelled_ends.append(panel)
 
     def finish(self, caption: str = "", part: str = "") -> CaptionedFigure:
         """Set ticks, sizes and a legend in which every label of the panels occurs once; returns the figure.
@@ -210,6 +246,8 @@ class Sheet:
             x, y = along * column + left, legend + (self._rows - 1 - down) * row + below
             panel.set_position((x / wide, y / high, layout.width / wide, layout.height / high))
             set_ticks(panel)
+        for panel in self._labelled_ends:
+            _label_ends(panel)
         missing = sum(_label_points(self.panels[k], points) for k, points in self._labels.items())
         unlabelled = f"{missing} points have no label, since others are too close." if missing else ""
         self.figure.caption = " ".join(f"{caption} {part} {unlabelled}".split())
@@ -218,7 +256,7 @@ class Sheet:
     def _legend(self, wide: float) -> float:
         """Draw the legend; returns its height in inches."""
         named: dict[str, Any] = {}
-        for panel in self.panels:
+        for panel in (one for one in self.panels if one not in self._labelled_ends):
             for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
                 named.setdefault(label, handle)
         if not named:
@@ -327,6 +365,31 @@ def _label_points(axes: Axes, points: list[tuple[float, float, str]]) -> int:
             text, (x, y), offset, textcoords="offset points", fontsize=6.0, color="0.25", va="bottom", ha="left"
         )
     return missing
+
+
+def _label_ends(axes: Axes) -> None:
+    """Write the names of lines right of the panel, each beside the end of its line or as close as others allow."""
+    height = 72.0 * axes.bbox.height / axes.figure.dpi
+    ends = []
+    named = ((line, str(line.get_label())) for line in axes.get_lines())
+    for line, name in ((line, name) for line, name in named if not name.startswith("_")):
+        points = axes.transAxes.inverted().transform(axes.transData.transform(line.get_xydata()))
+        finite = points[np.isfinite(points).all(axis=1)]
+        if len(finite):
+            ends.append((float(np.clip(finite[-1, 1], 0.0, 1.0)), textwrap.wrap(name, 15), line))
+    # From below, each at least a label above the one before; then from above, none beyond the panel.
+    ends.sort(key=lambda end: end[0])
+    room = [9.5 * len(lines) / height for _, lines, _ in ends]
+    places = [place for place, *_ in ends]
+    for k in range(1, len(ends)):
+        places[k] = max(places[k], places[k - 1] + 0.5 * (room[k] + room[k - 1]))
+    for k in reversed(range(len(ends))):
+        highest = 1.0 if k == len(ends) - 1 else places[k + 1] - 0.5 * (room[k] + room[k + 1])
+        places[k] = min(places[k], highest)
+    for place, (_, lines, line) in zip(places, ends, strict=True):
+        looks: dict[str, Any] = {"color": line.get_color(), "marker": line.get_marker(), "markersize": 3.5}
+        axes.plot(1.05, place, transform=axes.transAxes, clip_on=False, mfc=line.get_markerfacecolor(), **looks)
+        axes.text(1.09, place, "\n".join(lines), transform=axes.transAxes, fontsize=7.5, va="center_baseline")
 
 
 def _boxes(place: Array, text: str, clear: float) -> Iterator[Bbox]:

@@ -342,8 +342,8 @@ function drawPlot(figure) {
   const plot = PLOTS[figure.dataset.plot];
   const places = plot.panels.map(() => element("div"));
   const legend = element("div", { class: "legend", role: "group", "aria-label": "series" });
-  const panels = element("div", { class: "panels", role: "img", "aria-label": figure.querySelector("img")?.alt || figure.querySelector("figcaption").textContent }, ...places);
-  figure.prepend(...figure.querySelectorAll(".title"), legend, panels);
+  const panels = element("div", { class: "panels", role: "img", "aria-label": figure.querySelector("figcaption").textContent }, ...places);
+  figure.prepend(legend, panels);
   figure.classList.add("live");
   const renderers = plot.panels.map((panel, k) => drawPanel(plot, panel, places[k]));
   if (plot.costs) {
