@@ -23,7 +23,7 @@ from vibench import QPSolution, VariationalInequality
 from vibench.cli.console import print_frame
 from vibench.plugins import registry
 from vibench.report import html
-from vibench.report.figures import answer, problem_tables
+from vibench.report.figures import convergence, problem_tables
 from vibench.report.figures.style import styled, write_figure
 from vibench.results import formats
 from vibench.results.database import ResultsDatabase
@@ -95,8 +95,7 @@ def drawn(path: Path) -> str:
     stream = io.BytesIO()
     (data,) = [data for _, data in problem_tables(path)]
     with styled():
-        figure = answer(data)
-    assert figure is not None
+        figure = convergence(data)
     with styled():
         write_figure(figure, stream, "svg")
     return stream.getvalue().decode("utf-8")

@@ -214,6 +214,9 @@ def test_the_csv_is_what_is_shown(browser: Chrome, made: Path, downloads: Path, 
     )
 
 
+INTO_VIEW = "document.getElementById(arguments[0]).scrollIntoView()"
+
+
 def move(browser: Chrome, *places: tuple[float, float]) -> None:
     """Move the pointer from place to place."""
     actions = ActionChains(browser)
@@ -225,10 +228,11 @@ def move(browser: Chrome, *places: tuple[float, float]) -> None:
 def hover(browser: Chrome, name: str, series: int) -> dict[str, Any]:
     """Hover over the first point of a series until it says which cell it is; returns where and what it is.
 
-    What is above the plot may still take its place: the pointer is moved again to where the point is then.
+    What is above the plot may still take its place: page and pointer are moved again to where the point is then.
     """
 
     def point(browser: Chrome) -> dict[str, Any] | None:
+        browser.execute_script(INTO_VIEW, name)
         found: dict[str, Any] = browser.execute_script(POINT, name, series)
         move(browser, (2, 2), (found["x"], found["y"]))
         with contextlib.suppress(TimeoutException):
@@ -240,7 +244,7 @@ def hover(browser: Chrome, name: str, series: int) -> dict[str, Any]:
 
 
 def show_plot(browser: Chrome, name: str) -> None:
-    browser.execute_script("document.getElementById(arguments[0]).scrollIntoView()", name)
+    browser.execute_script(INTO_VIEW, name)
     ready = "return [...Bokeh.index.roots].some(v => v.el.closest('#' + arguments[0]) && v.frame.x_range.start)"
     awaited(browser, lambda b: b.execute_script(ready, name))
 

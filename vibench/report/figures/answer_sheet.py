@@ -32,11 +32,15 @@ def answer(data: ProblemTables) -> CaptionedFigure | None:
         return None
     sheet = Sheet(2, 2, f"{data.problem}: does a reduced model pay?", Layout(1.9, 1.7, "every"))
     field, stability, errors, cost = sheet.panels
+    beginning = (
+        f"Four panels show whether a reduced model of {data.problem} pays: a solution, inf-sup constants, errors "
+        "against the time of a query, and total cost against the number of queries."
+    )
     lines = [draw_alone(field, shown[len(shown) // 2])] if shown else [_empty(field, "No solution is recorded.")]
     if verdict is None or best is None:
         nothing = "No model takes part in a comparison."
         lines += [_empty(panel, nothing) for panel in (stability, errors, cost)]
-        return sheet.finish(f"Answer for {data.problem}. {' '.join(lines)}")
+        return sheet.finish(" ".join([beginning, *lines]))
     rivals = _rivals(data, best)
     names = _leading(rivals, best)
     looks = Looks(map(Series, names))
@@ -57,7 +61,7 @@ def answer(data: ProblemTables) -> CaptionedFigure | None:
         "best one, and the fastest of the other kind, enriched or not; a triangle, with its 95 % interval, marks from "
         "where the best model is cheaper."
     )
-    return sheet.finish(f"Answer for {data.problem}. {' '.join(lines)}")
+    return sheet.finish(" ".join([beginning, *lines]))
 
 
 def _empty(panel: Axes, text: str) -> str:
