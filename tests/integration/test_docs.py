@@ -224,7 +224,7 @@ def test_the_example_of_the_reference_is_a_study_and_its_rules_are_rules(tmp_pat
 @pytest.mark.parametrize(
     ("page", "texts", "written"),
     [
-        ("library.md", 13, {"runs", "tables", "decision.html", "inf-sup.svg"}),
+        ("library.md", 13, {"runs", "tables", "decision.html", "answer.svg"}),
         ("tolerances.md", 2, {"runs"}),
         ("methods.md", 35, {"runs", "points.npy"}),
     ],

@@ -139,15 +139,15 @@ class Run:
 
         return findings(self.path)
 
-    def figure(self, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
-        """One figure of the run, to be shown or saved; the kind is "answer", "convergence", "inf-sup", ….
+    def figure(self, kind: str, problem: str | None = None) -> Figure:
+        """One figure of the run, to be shown or saved: "answer", "solutions", "convergence", "bounds" or "solvers".
 
-        `problem` and, for figures of a cone, `dual` are labels, not needed where the run has one. Raises a
-        `RequestError` if there is no such figure, or the run has no data for it.
+        `problem` is its label, not needed where the run has one. Raises a `RequestError` if there is no such figure,
+        or the run has no data for it.
         """
         from vibench.report.figures import draw  # noqa: PLC0415  loads matplotlib
 
-        return draw(self.path, kind, problem, dual)
+        return draw(self.path, kind, problem)
 
     def write_tables(self, folder: Path | str | None = None) -> list[Path]:
         """Write every table as CSV, and the summary as Markdown; into `tables` beside the results file by default."""

@@ -68,15 +68,13 @@ def test_a_run_is_continued_and_followed(run: vibench.Run, capsys: pytest.Captur
 
 
 def test_figures_and_findings_are_there_and_wrong_requests_one_line(run: vibench.Run) -> None:
-    figure = run.figure("inf-sup", dual="cpg")
+    figure = run.figure("answer")
     assert isinstance(figure, matplotlib.figure.Figure)
     assert figure.axes
     assert run.findings[0].startswith("2 cells, 2 with every query ok")
     assert [one.problem for one in run.verdict] == ["radial-obstacle"]
     for kind, options, line in (
-        ("infsup", {}, "no figure is called 'infsup'; did you mean 'inf-sup'"),
-        ("inf-sup", {}, "the figure is of one dual strategy: name one of cpg, mcpg"),
-        ("inf-sup", {"dual": "gpc"}, "no dual strategy is called 'gpc'"),
+        ("anwser", {}, "no figure is called 'anwser'; did you mean 'answer'"),
         ("convergence", {"problem": "hertz"}, "no problem is called 'hertz'"),
         ("dimension", {}, "no figure is called 'dimension'"),
     ):

@@ -105,6 +105,11 @@ def data_of(axes: Axes) -> list[np.ndarray]:
     return [found[np.isfinite(found)] for found in values if np.isfinite(found).any()]
 
 
+def stability(figure: Figure) -> Axes:
+    """The panel of the inf-sup constants of an answer sheet."""
+    return next(axes for axes in figure.axes if axes.get_ylabel() == "β over span")
+
+
 def line_called(axes: Axes, label: str) -> Line2D:
     (line,) = [line for line in axes.get_lines() if line.get_label() == label]
     return line
@@ -134,11 +139,7 @@ def test_every_figure_can_be_read(drawn: Drawn, folder: Path) -> None:
     captions, names = figures.read_captions(folder), {path.stem for path in folder.glob("*.png")}
     for problem in problems():
         # No cell of this run has bounds.
-        assert {f"{problem}-{kind}" for kind, (_, of_dual) in KINDS.items() if not of_dual} - names == {
-            f"{problem}-bounds"
-        }
-        for dual in read_study("quick").dual:
-            assert f"{problem}-{dual.title}-inf-sup" in names
+        assert {f"{problem}-{kind}" for kind in KINDS} - names == {f"{problem}-bounds"}
     assert {path.stem for path in folder.glob("*.svg")} == names == {*drawn} == {*captions} != set()
     for name, figure in drawn.items():
         picture = Image.open(folder / f"{name}.png")
@@ -193,27 +194,26 @@ def test_convergence_and_constants_are_those_of_histories_and_queries(drawn: Dra
         assert data_of(beta)[0][-1] > 0.0
     queries = read_table(results, "queries")
     for problem in problems():
-        for dual in read_study("quick").dual:
-            mine = queries[(queries["problem"] == problem) & (queries["dual"] == dual.title)]
-            fixed = mine[mine["primal_tol"].notna() & (mine["solver"] == "piqp")]
-            span, cone = drawn[f"{problem}-{dual.title}-inf-sup"].axes
-            alone = problem == "hertz"  # one parameter, which is the abscissa
-            expected = fixed.sort_values("mu_1" if alone else "beta_span")
-            of_pga = next(line for line in span.get_lines() if str(line.get_label()).startswith("offline-pga"))
-            np.testing.assert_allclose(of_pga.get_ydata(), expected["beta_span"])
-            if alone:
-                np.testing.assert_array_equal(of_pga.get_xdata(), expected["mu_1"])
-                assert span.get_xlabel() == "radius µ [m]"
-            _, labels = span.get_legend_handles_labels()
-            for primal in read_study("quick").primal:
-                assert any(label.startswith(primal.title) for label in labels)
-            found = np.sort(np.asarray(line_called(span, "high-fidelity").get_ydata(), float))
-            np.testing.assert_allclose(found, np.sort(fixed["beta_hf_span"]))
-            assert len(cone.get_lines()) == len(labels)
+        panel = stability(drawn[f"{problem}-answer"])
+        found = np.asarray(line_called(panel, "high-fidelity").get_ydata(), float)
+        rows = queries[(queries["problem"] == problem) & (queries["solver"] == "piqp") & queries["primal_tol"].notna()]
+        fixed = [mine for _, mine in rows.groupby("dual") if np.allclose(np.sort(mine["beta_hf_span"]), np.sort(found))]
+        # That of one cone, in the order of the only parameter or of the constants.
+        expected = fixed[0].sort_values("mu_1" if problem == "hertz" else "beta_span")
+        np.testing.assert_allclose(line_called(panel, "offline-pga").get_ydata(), expected["beta_span"])
+        np.testing.assert_allclose(found, expected["beta_hf_span"])
+        assert np.all(data_of(panel)[0] > 0.0)
+    places = line_called(stability(drawn["obstacle-answer"]), "high-fidelity").get_xdata()
+    np.testing.assert_array_equal(places, range(1, len(expected) + 1))
+    hertz = stability(drawn["hertz-answer"])
+    assert hertz.get_xlabel() == "radius µ [m]"
+    np.testing.assert_array_equal(
+        line_called(hertz, "high-fidelity").get_xdata(),
+        np.sort(queries[queries["problem"] == "hertz"]["mu_1"].unique()),
+    )
     # β over the span of the decorrelated basis is zero in this run, which a logarithmic axis cannot show
-    axes = drawn["obstacle-mcpg-inf-sup"].axes[0]
-    assert [text.get_text() for text in axes.texts] == ["β = 0: decorrelated"]
-    assert "decorrelated" in axes.get_legend_handles_labels()[1]
+    texts = [text.get_text() for text in stability(drawn["obstacle-answer"]).texts]
+    assert "β = 0: decorrelated" in texts
 
 
 def test_a_logarithmic_panel_with_nothing_to_show_stays_empty(change: Change, draw: Draw) -> None:
@@ -239,7 +239,7 @@ def test_cells_that_failed_stop_no_others(change: Change, draw: Draw, results: P
         *(f"UPDATE {table} SET primal_tol = NULL" for table in ("cells", "queries", "histories")),
     )
     drawn = draw()
-    assert {"obstacle-mcpg-inf-sup", "obstacle-convergence"} <= set(drawn)
+    assert {"obstacle-answer", "obstacle-convergence"} <= set(drawn)
     for name, figure in drawn.items():
         for axes in figure.axes:
             assert not [label for label in axes.get_legend_handles_labels()[1] if "nan" in label], name
@@ -247,37 +247,26 @@ def test_cells_that_failed_stop_no_others(change: Change, draw: Draw, results: P
     assert draw_all(results, tmp_path / "nothing", ("png", "svg")) == ([], [])
 
 
-def test_a_solver_that_failed_takes_no_strategy_out_of_a_figure(change: Change, draw: Draw) -> None:
-    """One label with two options is two strategies."""
-    change(ONE_PAIR, "DELETE FROM queries WHERE solver = 'osqp' AND primal != 'decorrelated'")
-    change(*(f"UPDATE {table} SET primal_options = '{{\"k\": 1}}' WHERE solver = 'osqp' AND primal = 'decorrelated'"
-             for table in ("cells", "queries")))  # fmt: skip
-    spans = draw("inf-sup")["obstacle-mcpg-inf-sup"].axes
-    labels = [label for axes in spans for label in axes.get_legend_handles_labels()[1]]
-    assert any(label.startswith("online-supremizers") for label in labels)
-    assert {"decorrelated", "decorrelated (k = 1)"} <= set(labels)
-
-
 def test_without_a_fixed_enrichment_its_panels_are_left_out(change: Change, draw: Draw, results: Path) -> None:
     """Nor does one need cones: where every snapshot has no contact there is no generator, so no e_orth."""
-    change(ONE_PAIR, "DELETE FROM queries WHERE primal = 'offline-pga'", "DELETE FROM histories WHERE stage = 'cone'")
-    drawn = draw("convergence", "inf-sup", "answer")
+    change(ONE_PAIR, "DELETE FROM cells WHERE dual = 'cpg' OR primal = 'offline-pga'")
+    change("DELETE FROM queries WHERE primal = 'offline-pga'", "DELETE FROM histories WHERE stage = 'cone'")
+    drawn = draw("convergence", "answer")
     assert len(drawn["obstacle-convergence"].axes) == 2
-    assert "obstacle-mcpg-inf-sup" in drawn
+    assert line_called(stability(drawn["obstacle-answer"]), "online-supremizers")
     change("UPDATE queries SET solver = '–'")
     with pytest.raises(RequestError, match="the run has no data for the figure 'solvers' of obstacle"):
         figures.draw(results, "solvers", "obstacle")
 
 
-def test_prescribed_sizes_are_drawn_too_and_two_pairs_of_tolerances_get_two_panels(change: Change, draw: Draw) -> None:
-    change(ONE_PAIR, *(f"UPDATE {table} SET pod_tol = 0.1 WHERE solver = 'osqp'" for table in ("queries", "cells")))
-    drawn = draw("inf-sup")
-    assert len(drawn["obstacle-mcpg-inf-sup"].axes) == 4
+def test_prescribed_sizes_are_drawn_too(change: Change, draw: Draw) -> None:
     sizes = "pod_tol = NULL, pod_size = 13, dual_tol = NULL, dual_size = 20"
     enrichments = f"UPDATE histories SET {sizes} WHERE stage = 'enrichment'"
-    change(*(f"UPDATE {table} SET {sizes}" for table in ("queries", "cells")), enrichments)
-    figure = draw("convergence")["obstacle-convergence"]
-    assert all(data_of(axes) for axes in figure.axes)
+    change(ONE_PAIR, *(f"UPDATE {table} SET {sizes}" for table in ("queries", "cells")), enrichments)
+    change("DELETE FROM cells WHERE dual = 'cpg'")
+    drawn = draw("convergence", "answer")
+    assert all(data_of(axes) for axes in drawn["obstacle-convergence"].axes)
+    assert len(stability(drawn["obstacle-answer"]).get_lines()) >= 3
 
 
 def test_entries_that_share_a_label_get_files_of_their_own(change: Change, draw: Draw) -> None:
@@ -285,18 +274,17 @@ def test_entries_that_share_a_label_get_files_of_their_own(change: Change, draw:
     named = f"SET problem_options = '{other}' WHERE"
     change(ONE_PAIR, *(f"UPDATE {table} {named} solver = 'osqp'" for table in ("queries", "cells")))
     change("INSERT INTO histories SELECT * FROM histories", f"UPDATE histories {named} rowid % 2 = 0")
-    drawn = draw("convergence", "inf-sup")
-    assert {f"obstacle-{k}-{kind}" for k in (1, 2) for kind in ("convergence", "mcpg-inf-sup")} <= set(drawn)
+    assert {"obstacle-1-convergence", "obstacle-2-convergence"} <= set(draw("convergence"))
 
 
 def test_any_label_makes_a_file_in_the_folder(change: Change, draw: Draw) -> None:
-    """Labels that differ only in signs included: the other cone is called a:b."""
-    tables, old = ("cells", "queries", "histories"), "mcpg"
-    change(ONE_PROBLEM, *(f"UPDATE {table} SET dual = 'a:b' WHERE dual = 'cpg'" for table in tables))
+    """Labels that differ only in signs included: the other problem is called a:b."""
+    tables, old = ("cells", "queries", "histories"), "obstacle"
+    change(*(f"UPDATE {table} SET problem = 'a:b' WHERE problem = 'hertz'" for table in tables))
     for label in ("../up", "a\\b", "x" * 300):
-        change(*(f"UPDATE {table} SET dual = '{label}' WHERE dual = '{old}'" for table in tables))
-        drawn, old = draw("inf-sup"), label
-        assert sum(name.endswith("inf-sup") for name in drawn) == 2, label
+        change(*(f"UPDATE {table} SET problem = '{label}' WHERE problem = '{old}'" for table in tables))
+        drawn, old = draw("convergence"), label
+        assert len(drawn) == 2, label
 
 
 @pytest.mark.parametrize("count", [7, 12])
@@ -312,12 +300,6 @@ def test_a_panel_has_four_series_and_a_sentence_counts_the_others(count: int, ta
     figure = spaces.convergence(cones)
     assert len(figure.axes[1].get_lines()) == 4
     assert f"The tables have the other {count - 4} cones." in figure.caption
-    mine = data.restrict_to_dual("mcpg")
-    fixed = replace(mine, queries=many(mine.queries, "primal", "offline-pga"),
-                    histories=many(mine.histories, "primal", "offline-pga"))  # fmt: skip
-    spans = [axes for axes in spaces.inf_sup(fixed).axes if axes.get_ylabel().endswith("span")]
-    # The high-fidelity pair is in each.
-    assert [len(axes.get_legend_handles_labels()[1]) for axes in spans] in ([3, 4], [4, 4])
     sheet = answer_sheet.answer(replace(data, cells=many(data.cells, "primal", "offline-pga").reset_index()))
     assert f"{count - 4} other strategies are in the tables." in sheet.caption
 
@@ -326,8 +308,8 @@ def test_the_tightest_enrichment_went_farthest_and_the_best_model_pays_where_lin
     results: Path, change: Change
 ) -> None:
     """Whichever way its tolerance runs, and however many training parameters there are."""
-    mine = dict(of_file(results))["obstacle"].restrict_to_dual("mcpg")
-    steps = mine.histories[mine.histories["quantity"] == "beta_span_min"]
+    mine = dict(of_file(results))["obstacle"].histories
+    steps = mine[(mine["quantity"] == "beta_span_min") & (mine["dual"] == "mcpg")]
     last = steps[steps["step"] == steps["step"].max()].assign(step=steps["step"].max() + 1)
     tighter = pd.concat([steps, last]).assign(primal_tol=0.9, artefact="tighter")
     for tolerance in (0.5, 0.95):
@@ -374,7 +356,7 @@ def test_errors_in_a_figure_are_those_on_common_queries(change: Change, draw: Dr
 
 
 def test_bounds_are_drawn_against_the_errors_of_every_query_that_has_them(tables: Tables) -> None:
-    data = tables["obstacle"].restrict_to_dual("mcpg")
+    data = tables["obstacle"]
     names = ("u_energy", "lambda_natural")
     twice = {f"bound_online_{name}": 2.0 * data.queries[f"error_{name}_absolute"] for name in names}
     figure = effectivity.bounds(replace(data, queries=data.queries.assign(**twice)))
@@ -412,18 +394,12 @@ def test_a_profile_ends_at_the_share_that_was_solved(change: Change, draw: Draw)
     assert "The run has one solver, piqp: there is no performance profile to draw." in figure.caption
 
 
-def test_long_figures_show_what_matters_in_the_same_files(tables: Tables, tmp_path: Path) -> None:
-    data = tables["obstacle"].restrict_to_dual("mcpg")
-    pairs = pd.concat([data.queries.assign(pair=f"pair {k}") for k in range(8)])
-    figure = spaces.inf_sup(replace(data, queries=pairs))
-    assert figure is not None
-    assert len([axes for axes in figure.axes if axes.get_title()]) == 2
-    assert "The tables have the other 6 panels." in figure.caption
+def test_a_figure_drawn_twice_is_the_same_file(tables: Tables, tmp_path: Path) -> None:
     assert tables["hertz"].parameter == "radius µ [m]"
     assert tables["obstacle"].parameter == ""
     assert replace(tables["hertz"], pictures=()).parameter == "µ"
     data = tables["hertz"]
-    for name, drawing in ((name, KINDS[name][0]) for name in ("solutions", "convergence")):
+    for name, drawing in ((name, KINDS[name]) for name in ("solutions", "answer")):
         files = []
         for folder in ("one", "two"):
             (tmp_path / folder).mkdir(exist_ok=True)
@@ -437,7 +413,7 @@ def test_a_figure_that_fails_costs_itself_and_progress_names_every_one(
     change: Change, results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, main: Main
 ) -> None:
     change("DELETE FROM cells WHERE problem = 'hertz' OR dual = 'cpg'", ONE_PAIR)
-    failing = {"answer": (lambda _: {}["nan"], False), "inf-sup": KINDS["inf-sup"]}
+    failing = {"answer": lambda _: {}["nan"], "convergence": KINDS["convergence"]}
     monkeypatch.setattr(figures, "KINDS", failing)
     line = "the figure 'obstacle-answer' could not be drawn: KeyError: 'nan'"
     code, out, err = main("figures", str(results), "--out", str(tmp_path / "here"), "--format", "svg")
@@ -446,23 +422,21 @@ def test_a_figure_that_fails_costs_itself_and_progress_names_every_one(
     assert line in html.unescape(report_page(results))
     shown: list[tuple[str, int, int]] = []
     draw_all(results, tmp_path, ("svg",), lambda *now: shown.append(now))
-    assert shown == [("obstacle-answer", 0, 2), ("obstacle-mcpg-inf-sup", 1, 2), ("", 2, 2)]
+    assert shown == [("obstacle-answer", 0, 2), ("obstacle-convergence", 1, 2), ("", 2, 2)]
 
 
-def test_a_caption_says_which_tolerances_are_left_out(change: Change, draw: Draw) -> None:
-    """The loosest is shown; of two that are as loose up to round-off, the one with the larger δ."""
-    again = "problem = 'obstacle' AND primal = 'offline-pga'"
-    change(ONE_PAIR, f"CREATE TABLE again AS SELECT * FROM queries WHERE {again}")
-    change("UPDATE again SET primal_tol = 0.7, beta_span = beta_span * (1.0 + 1e-12)")
-    change("INSERT INTO queries SELECT * FROM again", "DROP TABLE again")
-    figure = draw("inf-sup")["obstacle-mcpg-inf-sup"]
-    assert "offline-pga, δ = 0.7" in figure.axes[0].get_legend_handles_labels()[1]
-    assert "offline-pga is shown at δ = 0.7, its loosest; left out: 0.5." in figure.caption
+def test_of_several_tolerances_the_loosest_is_shown(tables: Tables) -> None:
+    """Of two that are as loose up to round-off, the one with the larger δ."""
+    data = tables["obstacle"]
+    fixed = data.queries[data.queries["primal"] == "offline-pga"]
+    again = fixed.assign(primal_tol=0.7, beta_span=fixed["beta_span"] * (1.0 + 1e-12))
+    tighter = fixed.assign(primal_tol=0.2, beta_span=2.0 * fixed["beta_span"])
+    found = spaces.loosest(pd.concat([data.queries, again, tighter]))
+    assert set(found["primal_tol"].dropna()) == {0.7}
+    assert {"decorrelated", "online-supremizers"} <= set(found["primal"])
 
 
 def test_panels_share_axes_and_ranges(drawn: Drawn, results: Path) -> None:
-    span, cone = drawn["hertz-mcpg-inf-sup"].axes
-    assert span.get_xlim() == cone.get_xlim()
     fields = panels(drawn["obstacle-solutions"])
     for row in (fields[:3], fields[3:]):
         ranges = {axes.collections[0].get_clim() for axes in row}

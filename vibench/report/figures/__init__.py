@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,19 +16,18 @@ with foreign("matplotlib"):
     from matplotlib.figure import Figure
 
     from vibench.report.figures.answer_sheet import answer
-    from vibench.report.figures.data import ProblemTables, file_names, problem_tables
+    from vibench.report.figures.data import ProblemTables, problem_tables
     from vibench.report.figures.effectivity import bounds
     from vibench.report.figures.qp_solvers import solvers
     from vibench.report.figures.solutions import solutions
-    from vibench.report.figures.spaces import convergence, inf_sup
+    from vibench.report.figures.spaces import convergence
     from vibench.report.figures.style import CaptionedFigure, caption_of, save, styled
 
 Draw = Callable[[ProblemTables], CaptionedFigure | None]
 
-# Figures by the end of their file names, and whether every dual strategy of a problem has one.
-KINDS: dict[str, tuple[Draw, bool]] = {
-    "answer": (answer, False), "solutions": (solutions, False), "convergence": (convergence, False),
-    "bounds": (bounds, False), "solvers": (solvers, False), "inf-sup": (inf_sup, True),
+# Figures by the end of their file names.
+KINDS: dict[str, Draw] = {
+    "answer": answer, "solutions": solutions, "convergence": convergence, "bounds": bounds, "solvers": solvers,
 }  # fmt: skip
 
 # A figure to be drawn: name of its file, function that draws it, and its data.
@@ -40,46 +39,31 @@ Progress = Callable[[str, int, int], None]
 def drawings(problems: Iterable[tuple[str, ProblemTables]], kinds: Collection[str]) -> Iterator[FigureTask]:
     """Every figure of some kinds that problems may have; names begin with that of their problem."""
     for name, data in problems:
-        chosen = {kind: KINDS[kind] for kind in KINDS if kind in kinds}
-        yield from ((f"{name}-{kind}", draw, data) for kind, (draw, of_dual) in chosen.items() if not of_dual)
-        of_duals = {kind: draw for kind, (draw, of_dual) in chosen.items() if of_dual}
-        for dual, file in zip(data.duals, file_names(data.duals), strict=True) if of_duals else ():
-            of_cone = data.restrict_to_dual(dual)
-            yield from ((f"{name}-{file}-{kind}", draw, of_cone) for kind, draw in of_duals.items())
+        yield from ((f"{name}-{kind}", KINDS[kind], data) for kind in KINDS if kind in kinds)
 
 
-def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
+def draw(path: Path, kind: str, problem: str | None = None) -> Figure:
     """One figure of a results file.
 
     Its kind is a key of `KINDS`. The problem is given by its label ("LABEL, TRAINING" where it has several training
-    sets), the dual strategy for a kind that every one has by its own; `None` is for the only one.
+    sets); `None` is for the only one.
 
     Raises a `RequestError` if there is no such figure, or nothing to draw in it.
     """
-    by_problem = {data.problem: data for _, data in problem_tables(path)}
+    by_label = {data.problem: data for _, data in problem_tables(path)}
     if kind not in KINDS:
         raise unknown_name("figure", kind, KINDS)
-    data, (drawn, of_dual) = _only("problem", by_problem, problem), KINDS[kind]
-    if of_dual:
-        data = _only("dual strategy", {name: data.restrict_to_dual(name) for name in data.duals}, dual)
-    elif dual is not None and dual not in data.duals:
-        raise unknown_name("dual strategy", dual, data.duals)
+    if problem is None and len(by_label) != 1:
+        hint = f"name one of {', '.join(by_label)}" if by_label else "the run has none with queries"
+        raise RequestError(f"the figure is of one problem: {hint}")
+    if problem is not None and problem not in by_label:
+        raise unknown_name("problem", problem, by_label)
+    data = by_label[problem] if problem is not None else next(iter(by_label.values()))
     with styled():
-        figure = drawn(data)
+        figure = KINDS[kind](data)
     if figure is None:
         raise RequestError(f"the run has no data for the figure '{kind}' of {data.problem}")
     return figure
-
-
-def _only(noun: str, by_label: Mapping[str, ProblemTables], label: str | None) -> ProblemTables:
-    if label is None:
-        if len(by_label) != 1:
-            hint = f"name one of {', '.join(by_label)}" if by_label else "the run has none with queries"
-            raise RequestError(f"the figure is of one {noun}: {hint}")
-        return next(iter(by_label.values()))
-    if label not in by_label:
-        raise unknown_name(noun, label, by_label)
-    return by_label[label]
 
 
 def remove(folder: Path) -> None:

@@ -50,9 +50,8 @@ def answer(data: ProblemTables) -> CaptionedFigure | None:
     left_out = rivals["primal"].nunique() - len(names)
     lines.append(
         "Lower left, the larger of the mean errors of u and λ against the mean time of a query, a point for every "
-        f"model; the black line is a full solution, the dotted one {100 * verdict.error:g} %."
-        + f" {left_out} other strategies are in the tables."
-        * (left_out > 0)
+        "model, over the queries that all solved; the black line is a full solution, the dotted one "
+        f"{100 * verdict.error:g} %." + f" {left_out} other strategies are in the tables." * (left_out > 0)
     )
     _draw_costs(sheet, cost, _three(rivals, best), data.thresholds)
     sheet.label_ends(cost)
@@ -75,7 +74,7 @@ def _rivals(data: ProblemTables, best: Row) -> pd.DataFrame:
     cells = data.cells[eligible(data.cells) & data.cells["online_s"].notna()]
     alike = (cells["solver"] == best["solver"]) & (cells["accuracy"] == best["accuracy"])
     cells = cells[alike | (cells["solver"] == NO_SUCH_AXIS)]
-    compared = tables.on_common_queries(cells, data.queries).cells
+    compared = tables.on_common_queries(cells, data.queries)
     # Each gain is measured in the rounds of its cell, when the machine had one speed.
     seconds = float(best["hf_s"]) * compared["online_s"].astype(float) / compared["hf_s"].astype(float)
     return compared.assign(error=errors_of_solution(compared), ms=1e3 * seconds)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import count, pairwise
+from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -17,7 +17,6 @@ from vibench.plugins.registry import default_formulation
 from vibench.qp.status import Status
 from vibench.report.figures.style import Series
 from vibench.results import pictures
-from vibench.results.ranking import too_loose
 from vibench.results.read import in_order, read_table
 from vibench.results.schema import KEYS
 from vibench.study.cells import NO_SUCH_AXIS
@@ -54,10 +53,6 @@ class ProblemTables:
     thresholds: pd.DataFrame
     pictures: tuple[pictures.Shown, ...]
 
-    def restrict_to_dual(self, dual: str) -> ProblemTables:
-        frames = {name: value for name, value in vars(self).items() if isinstance(value, pd.DataFrame)}
-        return replace(self, **{name: frame[frame["dual"] == dual] for name, frame in frames.items()})
-
     @property
     def machine(self) -> str:
         return ", ".join(str(name) for name in self.cells["machine"].dropna().unique())
@@ -72,11 +67,6 @@ class ProblemTables:
         name, _, value = next(named, ("", "", ""))
         unit = value.partition(" ")[2]
         return f"{name} µ" * bool(name) + "µ" * (not name) + f" [{unit}]" * bool(unit)
-
-    @property
-    def duals(self) -> list[str]:
-        """Dual strategies, in the order of the tables."""
-        return [str(dual) for dual in self.queries["dual"].unique()]
 
 
 def problem_tables(
@@ -200,24 +190,6 @@ def series(name: Any, tolerance: Any = None, way: str = "") -> Series:
     return Series(str(name), "" if pd.isna(tolerance) else float(tolerance), way)
 
 
-def parts(items: list[Any], *, beside_reference: bool = False) -> list[list[Any]]:
-    """Series in groups of about the same size, for panels of at most four series."""
-    # One of the four may be the series of the high-fidelity model.
-    most = 3 if beside_reference else 4
-    count = -(-len(items) // most)
-    ends = [round(k * len(items) / count) for k in range(count + 1)] if count else []
-    return [items[a:b] for a, b in pairwise(ends)]
-
-
-def titled_parts(
-    title: str, items: list[Any], noun: str = "strategies", *, beside_reference: bool = False
-) -> Iterator[tuple[str, list[Any]]]:
-    """The `parts` of a list with the titles of their panels, which are numbered if there are several."""
-    groups = parts(items, beside_reference=beside_reference)
-    for k, group in enumerate(groups, 1):
-        yield title + f", {noun} {k} of {len(groups)}" * (len(groups) > 1), group
-
-
 def label(name: Any, tolerance: Any = None, way: str = "") -> str:
     """Label of a primal strategy with its tolerance and the `way` of its queries."""
     with_tolerance = str(name) if pd.isna(tolerance) else f"{name}, δ = {tolerance:g}"
@@ -231,16 +203,6 @@ def whole(number: Any) -> str:
 def label_of(row: Any) -> str:
     """The `label` of a row of the cells or the queries table."""
     return label(row["primal"], row["primal_tol"], way(row["assembly"], row["bounds"], row["correction"]))
-
-
-def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
-    """Timed cells, not `too_loose`, of the solver and accuracy with the most ok queries; the fastest of several."""
-    timed = cells[cells["online_s"].notna() & ~too_loose(cells, "solver") & ~too_loose(cells, "assembly")]
-    if timed.empty:
-        return timed
-    ways = timed.groupby(["solver", "accuracy"]).agg(ok=("queries_ok", "sum"), seconds=("online_s", "mean"))
-    solver, accuracy = ways.sort_values(["ok", "seconds"], ascending=[False, True]).index[0]
-    return timed[(timed["solver"] == solver) & (timed["accuracy"] == accuracy)]
 
 
 def file_names(labels: list[str]) -> list[str]:
@@ -261,22 +223,8 @@ def program_columns() -> list[str]:
     return [*(name for name in KEYS if name not in ("problem", "problem_options", "solver", "accuracy")), "query"]
 
 
-@dataclass(frozen=True)
-class Comparable:
-    """Cells of one problem whose errors can be compared."""
-
-    cells: pd.DataFrame  # those with enough ok queries; their means of errors are over the common ones
-    common: int  # queries that are ok in all of them
-    asked: int  # all queries
-
-    @property
-    def over(self) -> str:
-        """The queries that means are over, as the end of a sentence; "" for all of them."""
-        return "" if self.common == self.asked else f" over the {self.common} of {self.asked} queries that all solved"
-
-
-def on_common_queries(cells: pd.DataFrame, queries: pd.DataFrame) -> Comparable:
-    """Cells of one problem with means over the queries that are ok in all of them.
+def on_common_queries(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:
+    """Cells of one problem with means of errors over the queries that are ok in all of them.
 
     Cells with fewer than half of their queries ok are left out; queries of other cells are ignored.
     """
@@ -286,10 +234,8 @@ def on_common_queries(cells: pd.DataFrame, queries: pd.DataFrame) -> Comparable:
     kept = cells[(solved > 0) & (solved >= 0.5 * cells["queries"])]
     ok = ok[ok["cell"].isin(kept["cell"])]
     by = ok.groupby("query")["cell"].nunique()
-    common = by.index[by == len(kept)]
-    means = ok[ok["query"].isin(common)].groupby("cell")[["error_u", "error_lambda"]].mean()
-    compared = kept.assign(**{f"{name}_mean": kept["cell"].map(means[name]) for name in means})
-    return Comparable(compared, len(common), int(kept["queries"].max()) if len(kept) else 0)
+    means = ok[ok["query"].isin(by.index[by == len(kept)])].groupby("cell")[["error_u", "error_lambda"]].mean()
+    return kept.assign(**{f"{name}_mean": kept["cell"].map(means[name]) for name in means})
 
 
 def of_solvers(queries: pd.DataFrame) -> pd.DataFrame:

@@ -268,22 +268,6 @@ class Sheet:
         return 0.19 * math.ceil(len(named) / columns) + 0.12
 
 
-def two_rows(count: int, title: str) -> tuple[Sheet, list[Axes], list[Axes]]:
-    """A sheet of `count` upper panels with a lower one each; upper panels share their axes, and so do lower ones."""
-    columns = max(1, min(count, 3))
-    blocks = -(-count // columns) or 1
-    sheet = Sheet(2 * blocks, columns, title, sharex="all")
-    upper, lower = (
-        [sheet.panel(2 * (k // columns) + row, k % columns) for k in range(blocks * columns)] for row in (0, 1)
-    )
-    for panels in (upper, lower):
-        for panel in panels[1:]:
-            panel.sharey(panels[0])
-        for panel in panels[count:]:
-            panel.set_axis_off()
-    return sheet, upper[:count], lower[:count]
-
-
 def plot(axes: Axes, x: Any, y: Any, look: Look, label: str | None = None, **more: Any) -> None:
     """Draw a line in a look."""
     axes.plot(x, y, label=_legend_label(label), **look.line(len(x)) | more)
