@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -28,12 +29,16 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Put the pages of results with their files on the site."""
+    """Put the pages of results with their files on the site, and the notebook as a page."""
     root = Path(config.config_file_path).parent
     for path in sorted((root / RESULTS).rglob("*")):
         if path.suffix in SHOWN:
             name = path.relative_to(root).as_posix()
             files.append(File.generated(config, name, abs_src_path=str(path)))
+    notebook = json.loads((root / "examples" / "decision.ipynb").read_text(encoding="utf-8"))
+    cells = [(cell["cell_type"] == "code", "".join(cell["source"])) for cell in notebook["cells"]]
+    texts = [f"```python\n{source}\n```" if is_code else source for is_code, source in cells]
+    files.append(File.generated(config, "decision.md", content="\n\n".join(texts)))
     return files
 
 
