@@ -111,7 +111,7 @@ def projection_errors(evidence: Evidence) -> CaptionedFigure | None:
     for panel, points, symbol in panels:
         panel.plot(list(points.values()), list(points), label="paper: size for a tolerance", **CROSSES)
         for tolerance, size in points.items():
-            sheet.label(panel, size, tolerance, f"{symbol} = {size}")
+            panel.annotate(f"{symbol} = {size}", (size, tolerance), (3, 3), textcoords="offset points", fontsize=6)
     left.set(xlabel="number of modes N", ylabel="e_POD(N)", title="POD", yscale="log")
     right.set(xlabel="number of generators R", ylabel="e_CPG(R), e_mCPG(R)", title="CPG and mCPG", yscale="log")
     caption = (

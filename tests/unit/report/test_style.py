@@ -44,7 +44,6 @@ def sheet(text: str) -> Figure:
     made = Sheet(1, 1, text)
     for panel in made.panels:
         plot(panel, [1.0, 2.0], [1.0, 10.0], look_of(text), text)
-        made.label(panel, 1.5, 3.0, text)
         panel.set(xlabel=text, ylabel=text, title=text, yscale="log")
     return made.finish(text)
 
@@ -205,44 +204,5 @@ def test_a_file_has_its_caption_and_no_date(form: str) -> None:
     assert b"<dc:date>" not in file
 
 
-@given(st.lists(st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0)), min_size=1, max_size=60))
-@settings(max_examples=8, deadline=None)
-def test_labels_of_points_cover_neither_each_other_nor_leave_the_panel(points: list[tuple[float, float]]) -> None:
-    made = Sheet(1, 1)
-    (panel,) = made.panels
-    panel.set(xlim=(-0.1, 1.1), ylim=(-0.1, 1.1))
-    for k, (x, y) in enumerate(points):
-        made.label(panel, x, y, f"({k}, 43), δ = 0.5")
-    figure = made.finish()
-    boxes = [text.get_window_extent(RendererAgg(10, 10, figure.dpi)) for text in panel.texts]
-    assert 1 <= len(boxes) <= len(points)
-    frame = panel.get_window_extent()
-    for k, box in enumerate(boxes):
-        assert frame.x0 - 1 <= box.x0 <= box.x1 <= frame.x1 + 1
-        assert frame.y0 - 1 <= box.y0 <= box.y1 <= frame.y1 + 1
-        assert not any(box.overlaps(other) for other in boxes[:k])
-    missing = len(points) - len(boxes)
-    assert caption_of(figure) == (f"{missing} points have no label, since others are too close." if missing else "")
-
-
 def test_panels_that_are_left_over_are_hidden() -> None:
     assert [one.axison for one in Sheet.with_panels(7, "seven").panels] == [True] * 7 + [False] * 2
-
-
-def test_a_point_without_a_text_is_kept_clear() -> None:
-    """The label stands on another side than it would otherwise, and the empty one is not missed."""
-    sides = []
-    for others in ((), ((0.6, 0.5),)):
-        made = Sheet(1, 1)
-        (panel,) = made.panels
-        panel.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
-        made.label(panel, 0.5, 0.5, "(8, 43)")
-        for x, y in others:
-            made.label(panel, x, y, "")
-        figure = made.finish()
-        (label,) = panel.texts
-        box = label.get_window_extent(RendererAgg(10, 10, figure.dpi))
-        sides.append(box.x0 > panel.transData.transform((0.5, 0.5))[0])
-        assert not any(box.contains(*panel.transData.transform(other)) for other in others)
-        assert not caption_of(figure)
-    assert sides == [True, False]

@@ -46,14 +46,15 @@ def answer(data: ProblemTables) -> CaptionedFigure | None:
     looks = Looks(map(Series, names))
     lines.append(draw_stability(stability, data, best, names, looks) or _empty(stability, "There are no constants."))
     sheet.label_ends(stability)
-    _draw_errors(sheet, errors, rivals, names, looks, verdict)
+    _draw_errors(errors, rivals, names, looks, verdict)
     left_out = rivals["primal"].nunique() - len(names)
     lines.append(
         "Lower left, the larger of the mean errors of u and λ against the mean time of a query, a point for every "
         "model, over the queries that all solved; the black line is a full solution, the dotted one "
         f"{100 * verdict.error:g} %." + f" {left_out} other strategies are in the tables." * (left_out > 0)
     )
-    _draw_costs(sheet, cost, _three(rivals, best), data.thresholds)
+    _draw_costs(cost, _three(rivals, best), data.thresholds)
+    sheet.label_ends(errors)
     sheet.label_ends(cost)
     lines.append(
         "Lower right, CPU seconds offline and online together against the number of queries, of the full model, the "
@@ -86,22 +87,18 @@ def _leading(cells: pd.DataFrame, best: Row) -> list[str]:
     return sorted([str(best["primal"]), *map(str, smallest.index)])
 
 
-def _draw_errors(
-    sheet: Sheet, panel: Axes, cells: pd.DataFrame, names: list[str], looks: Looks, verdict: Verdict
-) -> None:
+def _draw_errors(panel: Axes, cells: pd.DataFrame, names: list[str], looks: Looks, verdict: Verdict) -> None:
     for name in names:
-        mine = cells[(cells["primal"] == name) & (cells["error"] > 0.0)]
-        scatter(panel, mine["ms"], mine["error"], looks[Series(name)])
-        for index in mine.index:
-            first = index == mine["error"].idxmin()
-            sheet.label(panel, mine["ms"][index], mine["error"][index], name if first else "")
+        mine = cells[(cells["primal"] == name) & (cells["error"] > 0.0)].sort_values("error", ascending=False)
+        # Its name stands beside the panel as high as the last of its points, the one with the smallest error.
+        scatter(panel, mine["ms"], mine["error"], looks[Series(name)], name)
     full, limit = 1e3 * verdict.full_s, f"{100 * verdict.error:g} %"
     panel.axvline(full, color="black")
     panel.annotate("full solution", (full, 0.98), xycoords=("data", "axes fraction"), xytext=(-2, 0),
                    textcoords="offset points", rotation=90, ha="right", va="top", fontsize=7)  # fmt: skip
     panel.axhline(verdict.error, color="0.4", linewidth=0.8, linestyle=(0, (1, 2)))
-    panel.annotate(limit, (1.0, verdict.error), xycoords=("axes fraction", "data"), xytext=(3, 0),
-                   textcoords="offset points", va="center", fontsize=7)  # fmt: skip
+    panel.annotate(limit, (0.0, verdict.error), xycoords=("axes fraction", "data"), xytext=(3, 2),
+                   textcoords="offset points", fontsize=7)  # fmt: skip
     panel.set(xlabel="mean time of a query [ms]", ylabel="mean error of u and λ", xscale="log", yscale="log")
     panel.margins(0.12)
 
@@ -116,7 +113,7 @@ def _three(cells: pd.DataFrame, best: Row) -> pd.DataFrame:
     return pd.concat([own, chosen.nsmallest(1, "online_s")])
 
 
-def _draw_costs(sheet: Sheet, panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame) -> None:
+def _draw_costs(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame) -> None:
     queries, looks = np.geomspace(1.0, 1e6, 61), Looks(Series(cell.primal, way=cell.way) for cell in cells.itertuples())
     one = cells.iloc[0]
     plot(panel, queries, one["hf_setup_s"] + queries * one["hf_s"], style.HIGH_FIDELITY_LOOK, HIGH_FIDELITY)
@@ -129,6 +126,7 @@ def _draw_costs(sheet: Sheet, panel: Axes, cells: pd.DataFrame, thresholds: pd.D
         shape = {Meaning.FROM: ">", Meaning.UNTIL: "<"}[Meaning(row.meaning)]
         panel.plot(row.benefit_threshold, at, shape, c="black", ms=5, mfc="white", zorder=5)
         panel.hlines(at, row.threshold_low, row.threshold_high, colors="black", lw=0.8, zorder=5)
-        sheet.label(panel, row.benefit_threshold, at, f"{row.benefit_threshold:.0f} queries")
+        panel.annotate(f"{row.benefit_threshold:.0f} queries", (row.benefit_threshold, at), (4, -9),
+                       textcoords="offset points", fontsize=7)  # fmt: skip
     panel.set(xlabel="number of queries", ylabel="offline + online [s]", xlim=(1.0, queries[-1]))
     panel.set(xscale="log", yscale="log")

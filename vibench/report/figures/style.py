@@ -8,7 +8,7 @@ import re
 import textwrap
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -21,9 +21,7 @@ import numpy as np
 from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.transforms import Bbox
 
-from vibench.arrays import Array
 from vibench.text import printable
 
 # Equidistant in lightness (CIELAB, 22 to 78 in steps of 8), so that grey print keeps them apart, with the hues that are
@@ -198,7 +196,6 @@ class Sheet:
         self.figure = CaptionedFigure()
         made = self.figure.subplots(rows, columns, squeeze=False, sharex=sharex, sharey=sharey)
         self.panels: list[Axes] = list(made.ravel())
-        self._labels: dict[int, list[tuple[float, float, str]]] = {}
         self._labelled_ends: list[Axes] = []
         for panel in self.panels:
             # Every panel has numbers, whether it shares its axes or not.
@@ -217,18 +214,14 @@ class Sheet:
         """One panel."""
         return self.panels[row * self._columns + column]
 
-    def label(self, panel: Axes, x: float, y: float, text: str) -> None:
-        """Write a text at a point, where there is room for it in the finished figure; without one keep it clear."""
-        self._labels.setdefault(self.panels.index(panel), []).append((x, y, text))
-
     def label_ends(self, panel: Axes) -> None:
-        """Name the lines of a panel beside their right ends, at most five, in place of the legend."""
+        """Name the lines, or points, of a panel right of it, at most five, in place of the legend."""
         self._labelled_ends.append(panel)
 
     def finish(self, caption: str = "", part: str = "") -> CaptionedFigure:
         """Set ticks, sizes and a legend in which every label of the panels occurs once; returns the figure.
 
-        The caption says, too, what it leaves out (`part`), and how many labels of points have no room.
+        The caption says, too, what it leaves out (`part`).
         """
         layout = self._layout
         # Room in inches left of and below a panel for ticks and labels, right of it, and for the title above it.
@@ -248,9 +241,7 @@ class Sheet:
             set_ticks(panel)
         for panel in self._labelled_ends:
             _label_ends(panel)
-        missing = sum(_label_points(self.panels[k], points) for k, points in self._labels.items())
-        unlabelled = f"{missing} points have no label, since others are too close." if missing else ""
-        self.figure.caption = " ".join(f"{caption} {part} {unlabelled}".split())
+        self.figure.caption = " ".join(f"{caption} {part}".split())
         return self.figure
 
     def _legend(self, wide: float) -> float:
@@ -321,36 +312,6 @@ def positive(values: Any, floor: float) -> np.ndarray[Any, np.dtype[np.float64]]
     return np.where(numbers > floor, numbers, np.nan)
 
 
-def _label_points(axes: Axes, points: list[tuple[float, float, str]]) -> int:
-    """Write a label at every point (x, y, text) where there is room; returns the number of those without room.
-
-    A point without a text is only kept clear. The axes must have their final size and limits.
-    """
-    drawn = [(x, y, text) for x, y, text in points if np.isfinite([x, y]).all()]
-    if not drawn:
-        return 0
-    scale = 72.0 / float(axes.figure.dpi)
-    places = scale * axes.transData.transform([(x, y) for x, y, _ in drawn])
-    panel = Bbox(scale * axes.bbox.get_points())
-    # Lengths are in points (1/72 inch): a label keeps 3.5 clear around every point.
-    clear, missing = 3.5, 0
-    taken = [Bbox.from_extents(x - clear, y - clear, x + clear, y + clear) for x, y in places]
-    for (x, y, text), place in zip(drawn, places, strict=True):
-        if not text:
-            continue
-        inside = (box for box in _boxes(place, text, clear) if all(panel.contains(*end) for end in box.get_points()))
-        box = next((box for box in inside if not box.count_overlaps(taken)), None)
-        if box is None:
-            missing += 1
-            continue
-        taken.append(box)
-        offset = tuple(box.min - place)
-        axes.annotate(
-            text, (x, y), offset, textcoords="offset points", fontsize=6.0, color="0.25", va="bottom", ha="left"
-        )
-    return missing
-
-
 def _label_ends(axes: Axes) -> None:
     """Write the names of lines right of the panel, each beside the end of its line or as close as others allow."""
     height = 72.0 * axes.bbox.height / axes.figure.dpi
@@ -374,16 +335,6 @@ def _label_ends(axes: Axes) -> None:
         looks: dict[str, Any] = {"color": line.get_color(), "marker": line.get_marker(), "markersize": 3.5}
         axes.plot(1.05, place, transform=axes.transAxes, clip_on=False, mfc=line.get_markerfacecolor(), **looks)
         axes.text(1.09, place, "\n".join(lines), transform=axes.transAxes, fontsize=7.5, va="center_baseline")
-
-
-def _boxes(place: Array, text: str, clear: float) -> Iterator[Bbox]:
-    """Boxes of a text beside a point, those first that are tried first: right, left, above, below, corners."""
-    # In a font of 6 points; no text is rendered to measure it.
-    width, height = 0.62 * 6.0 * len(text), 1.15 * 6.0
-    for across, up in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)):
-        x = place[0] + (clear + 1.0 if across > 0 else -clear - 1.0 - width if across < 0 else -0.5 * width)
-        y = place[1] + (clear if up > 0 else -clear - height if up < 0 else -0.5 * height)
-        yield Bbox.from_bounds(x, y, width, height)
 
 
 @cache
