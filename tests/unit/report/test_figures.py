@@ -199,11 +199,11 @@ def test_convergence_and_constants_are_those_of_histories_and_queries(drawn: Dra
         rows = queries[(queries["problem"] == problem) & (queries["solver"] == "piqp") & queries["primal_tol"].notna()]
         # Those of the cone of the best model, in the order of the only parameter or of the constants.
         by, shown = "mu_1" if problem == "hertz" else "beta_span", line_called(panel, "offline-pga").get_ydata()
-        (expected,) = [
+        expected = next(
             ordered
             for _, mine in rows.groupby("dual")
             if np.allclose((ordered := mine.sort_values(by, kind="stable"))["beta_span"], shown, rtol=1e-9)
-        ]
+        )
         np.testing.assert_allclose(found, expected["beta_hf_span"])
         assert np.all(data_of(panel)[0] > 0.0)
     places = line_called(stability(drawn["obstacle-answer"]), "high-fidelity").get_xdata()
