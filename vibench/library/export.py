@@ -27,6 +27,7 @@ from vibench.model.chebyshev import AffinePolynomial
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline import c_source
 from vibench.offline.c_source import ExactMember
+from vibench.offline.compiled import first_sets
 from vibench.offline.models import Model
 from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, InaccurateError, declared_terms, member_polynomials
 from vibench.provenance import distribution_version
@@ -148,11 +149,11 @@ def exported(
     if bases:
         arrays |= {"basis": basis, "generators": queried.generators}
     arrays |= _output_arrays(model, basis, queried.generators, certificate)
-    exact: dict[str, ExactMember] = {}
     # The members that the model evaluates by declared sums whose coefficients are all expressions.
-    for name in declared_terms(queried) if c else ():
-        if (member := ExactMember.from_sum(queried.problem.affine[name], members[name].terms)) is not None:
-            exact[name] = member
+    declared = {name: queried.problem.affine[name] for name in declared_terms(queried)} if c else {}
+    sums = {name: ExactMember.from_sum(declared[name], members[name].terms) for name in declared}
+    exact = {name: member for name, member in sums.items() if member is not None}
+    arrays |= first_sets(queried.problem, members) if c else {}
     if certificate is not None:
         terms = {name: np.eye(len(member.thetas)) for name, member in exact.items()}
         if rotation is not None and "A" in terms:
@@ -217,7 +218,7 @@ def _licence(distribution: str) -> str:
 def _npz(model: ExportedModel) -> bytes:
     arrays: dict[str, Any] = {"format": np.array(FORMAT), "about": np.array(json.dumps(dict(model.about)))}
     # the script bounds no errors, and of a certificate only the C source needs more than its `lift`
-    left_out = {name for name in model.arrays if name.startswith("certificate_") and name != "certificate_lift"}
+    left_out = {n for n in model.arrays if n.startswith(("certificate_", "start_")) and n != "certificate_lift"}
     arrays |= {name: array for name, array in model.arrays.items() if name not in left_out}
     for name, member in model.members.items():
         arrays |= {f"{name}_indices": member.indices, f"{name}_coefficients": member.coefficients}
@@ -281,6 +282,7 @@ def _certificate_arrays(
         loads = np.zeros((base.X.dim, len(corrections.rows)))
         loads[unknowns] = base.constraint[corrections.rows].toarray().T
         found["lift"] = base.X.riesz(loads)
+    of_A = "A" if _stiffness_coefficients(certificate) is None else "theta_A"
     error = {name: 0.0 if name in exact else _error(polynomial) for name, polynomial in polynomials.items()}
     size = residual.norms.copy()  # of all terms of residuals
     size[residual.kept] = np.hypot(np.linalg.norm(residual.factor, axis=0), residual.remainder * residual.inverse_scale)
@@ -295,7 +297,7 @@ def _certificate_arrays(
         # off the diagonal every entry counts twice; products of Chebyshev polynomials are at most 1
         "energy_error": np.array(
             np.sqrt(2.0) * error["A"]
-            + np.abs(polynomials["A"].coefficients).sum(axis=0) @ certificate.energy_round_off
+            + np.abs(polynomials[of_A].coefficients).sum(axis=0) @ certificate.energy_round_off
         ),
         "constraint_error": np.array(error["theta_B"]), "multiplier_norms": of_lam,
         "bound_errors": error["theta_g"] * np.linalg.norm(terms, axis=1),

@@ -102,8 +102,10 @@ def interpolate_on_box(
         kept = {name: _needed(c, 0.1 * tolerance) for name, c in along.coefficients(counts).items()}
         polynomials = {}
         for name, given in terms.items():
-            theta = _without_smallest(kept[name][1], 0.1 * tolerance) * units[name]
-            polynomials[name] = AffinePolynomial(kept[name][0], theta, given, np.inf, 1.0)
+            indices, c = kept[name]
+            # Products of Chebyshev polynomials are at most 1: what is left out sums up to a tenth of the tolerance.
+            theta = np.where(np.abs(c) > 0.1 * tolerance / c.size, c, 0.0) * units[name]
+            polynomials[name] = AffinePolynomial(indices, theta, given, np.inf, 1.0)
         for name in kept.keys() - terms.keys():
             indices, c = kept[name]
             count, size = c.shape
@@ -114,7 +116,7 @@ def interpolate_on_box(
         if max(p.error for p in polynomials.values()) <= tolerance:
             # only now: the decomposition of a large array takes minutes
             for name in kept.keys() - terms.keys():
-                polynomials[name] = measured(name, _factorised(*kept[name], units[name], 0.1 * tolerance))
+                polynomials[name] = compressed(polynomials[name], tolerance)
         if max(p.error for p in polynomials.values()) <= tolerance or prod(counts) >= 0.7 * budget:
             break
         counts = [count + max(1, count // 4) if count > 1 else count for count in counts]
@@ -188,26 +190,31 @@ def _needed(coefficients: Array, tolerance: float) -> tuple[Indices, Array]:
     return np.stack(np.unravel_index(kept, shape[:-1]), axis=1), flat[kept]
 
 
-def _factorised(indices: Indices, coefficients: Array, unit: Any, tolerance: float) -> AffinePolynomial:
-    """The polynomial with fewest terms, orthogonal ones, by the singular value decomposition of its coefficients."""
-    left, sigma, right = svd(coefficients)
-    # a value is a sum over all rows, with factors of at most 1
-    lost = np.sqrt(len(indices) * np.append(np.cumsum(sigma[::-1] ** 2)[::-1], 0.0))
-    count = max(1, int(np.argmax(lost <= tolerance)))
-    theta = _without_smallest(left[:, :count] * sigma[:count], tolerance)
-    return AffinePolynomial(indices, theta, right[:count] * unit, np.inf, 1.0)
+def compressed(polynomial: AffinePolynomial, tolerance: float) -> AffinePolynomial:
+    """The polynomial with orthogonal terms, and few coefficients, up to a tenth of the tolerance.
 
-
-def _without_smallest(coefficients: Array, tolerance: float) -> Array:
-    """Coefficients without the smallest ones, which sum up to at most a tolerance.
-
-    Products of Chebyshev polynomials are at most 1 on the box, and terms have norm 1: no value changes by more.
+    Terms are singular vectors. The largest threshold is found below which coefficients can be dropped. Numbers that
+    single precision changes by less than it have that precision. The error grows by what all this changes.
     """
-    sizes = np.abs(coefficients).ravel()
-    rising = np.argsort(sizes, kind="stable")
-    kept = coefficients.ravel().copy()
-    kept[rising[np.cumsum(sizes[rising]) <= tolerance]] = 0.0
-    return np.asarray(kept.reshape(coefficients.shape))
+    right, triangle = np.linalg.qr(polynomial.terms.T)
+    U, sigma, V = svd(polynomial.coefficients @ triangle.T)
+    whole, vectors, unit = U * sigma, V @ right.T, np.random.default_rng(0).random((100, polynomial.indices.shape[1]))
+    # Products of Chebyshev polynomials are largest at corners.
+    unit[:30] = np.rint(unit[:30])
+    factors, values = products(polynomial.indices, unit), polynomial.evaluate(unit)
+    for threshold in tolerance * polynomial.scale * 10.0 ** -np.arange(0.0, 8.0, 0.25):
+        # The 24 bits of single precision.
+        theta, terms, limit = np.where(np.abs(whole) > threshold, whole, 0.0), vectors.copy(), 2.0**24 * threshold
+        small, minor = np.abs(theta).max(axis=1) <= limit, np.abs(factors @ theta).max(axis=0) <= limit
+        theta[small], terms[minor] = theta[small].astype(np.float32), terms[minor].astype(np.float32)
+        change = float(np.linalg.norm(factors @ theta @ terms - values, axis=1).max()) / polynomial.scale
+        if change <= min(0.1 * tolerance, tolerance - polynomial.error):
+            break
+    kept, used = np.count_nonzero(theta, axis=1) > 0, np.count_nonzero(theta, axis=0) > 0
+    # C and NumPy have no polynomials without products.
+    kept[0], used[0] = kept[0] or not kept.any(), used[0] or not used.any()
+    error = polynomial.error + change
+    return AffinePolynomial(polynomial.indices[kept], theta[kept][:, used], terms[used], error, polynomial.scale)
 
 
 def _stacked(evaluated: Sequence[Mapping[str, Array]]) -> dict[str, Array]:

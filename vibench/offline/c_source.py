@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vibench.arrays import Array, Indices
+from vibench.arrays import Array, Indices, Mask
 from vibench.errors import RequestError
 from vibench.interfaces.affine import CONSTANTS, AffineSum, Expression, Thetas
 from vibench.interfaces.problem import MEMBERS
@@ -76,6 +76,7 @@ def source(
     name = re.sub(r"\W", "_", f"model_{stem}" if not stem[:1].isalpha() else stem, flags=re.ASCII)
     box, cell, polynomials = about["parameters"], about["cell"], {**members, **thetas}
     own = {key: exact.get(key, polynomial) for key, polynomial in polynomials.items()}
+    parameters, sets, factor = (arrays.get(f"start_{name}", np.zeros(0)) for name in ("parameters", "sets", "factor"))
     values = {
         "name": name, "macro": name.upper(),
         "origin": _comment(", ".join(str(cell.get(key, "")) for key in ("problem", "dual", "primal", "cell"))),
@@ -85,9 +86,11 @@ def source(
         "dimension": len(arrays["lower"]), "unknowns": members["f"].terms.shape[1],
         "constraints": members["g"].terms.shape[1],
         "degree": max((max(one.degrees) for one in own.values() if isinstance(one, AffinePolynomial)), default=0),
-        "terms": max(len(member.terms) for member in own.values()), "accuracy": repr(float(about["accuracy"])),
+        "terms": max(-(-len(member.terms) // 4) * 4 for member in own.values()),
+        "accuracy": repr(float(about["accuracy"])), "factorised": int(factor.size > 0), "factor": _numbers(factor),
         "lower": _numbers(arrays["lower"]), "upper": _numbers(arrays["upper"]),
-        "members": "\n".join(_member(key, own[key]) for key in MEMBERS),
+        "members": "\n".join(_member(key, own[key]) for key in MEMBERS), "starts": len(parameters),
+        "start_parameters": _numbers(parameters), "start_sets": _numbers(sets, "char"),
     }  # fmt: skip
     # A function that nothing calls would be a warning of the compiler.
     some = any(isinstance(one, AffinePolynomial) for one in own.values())
@@ -140,42 +143,54 @@ def _certified(thetas: Mapping[str, AffinePolynomial | ExactMember], arrays: Map
     }  # fmt: skip
 
 
-def _array(name: str, array: Array | Indices) -> str:
-    kind = "int" if array.dtype.kind in "iu" and array.ndim else "double"
-    return f"static const {kind} {name}[] = {{\n{_numbers(array if array.size else np.zeros(1))}\n}};"
+def _array(name: str, array: Array | Indices, kind: str = "") -> str:
+    kind = kind or ("int" if array.dtype.kind in "iu" and array.ndim else "double")
+    return f"static const {kind} {name}[] = {{\n{_numbers(array, kind)}\n}};"
 
 
 def _member(name: str, member: AffinePolynomial | ExactMember) -> str:
     """Terms of one member, and a function that evaluates its θ."""
-    # A polynomial has arrays of degrees, and of coefficients that are not zero, product by product.
-    top = f"static void {name}_thetas(const double *mu, double polynomials[DIMENSION][DEGREE + 1], double *theta)\n{{\n"
-    if isinstance(member, ExactMember):
-        lines = "".join(f"    theta[{q}] = {text};\n" for q, text in enumerate(member.thetas))
-        return (
-            f"enum {{ {name}_TERMS = {len(member.terms)} }};\n"
-            f"static const double {name}_terms[] = {{\n{_numbers(member.terms)}\n}};\n"
-            f"{top}    (void)mu;\n    (void)polynomials;\n{lines}}}\n"
-        )
-    products, terms = member.coefficients.shape
-    rows, columns = np.nonzero(member.coefficients)
-    starts = np.searchsorted(rows, np.arange(products + 1))
-    # C has no arrays without elements.
-    columns, values = (columns, member.coefficients[rows, columns]) if len(rows) else (np.zeros(1, int), np.zeros(1))
-    return (
-        f"enum {{ {name}_PRODUCTS = {products}, {name}_TERMS = {terms} }};\n"
-        f"static const int {name}_degrees[] = {{\n{_numbers(member.indices)}\n}};\n"
-        f"static const int {name}_starts[] = {{\n{_numbers(starts)}\n}};\n"
-        f"static const int {name}_columns[] = {{\n{_numbers(columns)}\n}};\n"
-        f"static const double {name}_coefficients[] = {{\n{_numbers(values)}\n}};\n"
-        f"static const double {name}_terms[] = {{\n{_numbers(member.terms)}\n}};\n"
-        f"{top}    (void)mu;\n    add_products(polynomials, {name}_PRODUCTS, {name}_degrees, {name}_starts, "
-        f"{name}_columns, {name}_coefficients, theta);\n}}\n"
+    count = len(member.terms)
+    single, order = np.zeros(count, bool), np.arange(count)
+    if isinstance(member, AffinePolynomial):
+        # Terms of double precision come first, and those that most products need.
+        single = _is_single(member.terms)
+        order = np.lexsort([-np.count_nonzero(member.coefficients, axis=0), single])
+    top = (
+        f"enum {{ {name}_DOUBLES = {count - single.sum()}, {name}_SINGLES = {single.sum()} }};\n"
+        f"{_array(f'{name}_terms', member.terms[order][~single[order]])}\n"
+        f"{_array(f'{name}_single_terms', member.terms[order][single[order]], 'float')}\n"
+        f"static void {name}_thetas(const double *mu, double polynomials[DIMENSION][DEGREE + 1], double *theta)\n"
+        "{\n    (void)mu;\n    (void)polynomials;\n"
     )
+    if isinstance(member, ExactMember):
+        return top + "".join(f"    theta[{q}] = {text};\n" for q, text in enumerate(member.thetas)) + "}\n"
+    # Every product has a prefix of coefficients, in fours.
+    coefficients = np.pad(member.coefficients[:, order], ((0, 0), (0, -count % 4)))
+    places = np.arange(coefficients.shape[1])
+    counts = -(-np.max((coefficients != 0.0) * (places + 1), axis=1) // 4) * 4
+    small, arrays, calls = _is_single(coefficients), "", ""
+    for kind, number, chosen in (("products", "double", ~small), ("small_products", "float", small)):
+        own, kept = f"{name}_{kind}", places < counts[chosen, None]
+        arrays += f"{_array(f'{own}_degrees', member.indices[chosen], 'unsigned short')}\n"
+        arrays += f"{_array(f'{own}_counts', counts[chosen], 'unsigned short')}\n"
+        arrays += f"{_array(f'{own}_coefficients', coefficients[chosen][kept], number)}\n"
+        given = f"{own}_degrees, {own}_counts, {own}_coefficients"
+        calls += f"    add_{kind}(polynomials, {chosen.sum()}, {given}, theta);\n"
+    return f"{arrays}{top}{calls}}}\n"
 
 
-def _numbers(values: Array | Indices) -> str:
+def _is_single(rows: Array) -> Mask:
+    """Which rows single precision holds exactly."""
+    with np.errstate(over="ignore"):
+        return np.asarray((rows == rows.astype(np.float32)).all(axis=1))
+
+
+def _numbers(values: Array | Indices, kind: str = "double") -> str:
     """Numbers that a compiler reads back to the last bit."""
-    texts = [repr(value).replace("inf", "HUGE_VAL") for value in np.ravel(values).tolist()]
+    # C has no arrays without elements.
+    flat: Any = np.ravel(values if values.size else np.zeros(1)).astype({"float": "f", "double": "d"}.get(kind, "q"))
+    texts = [str(value).replace("inf", "HUGE_VAL") for value in flat]
     return ",\n".join(", ".join(texts[k : k + 4]) for k in range(0, len(texts), 4))
 
 

@@ -21,24 +21,24 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import RequestError, UnsupportedError, foreign
 from vibench.files import scratch
-from vibench.interfaces.problem import MEMBERS, VariationalInequality
+from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
+from vibench.interfaces.validation import training_parameters
 from vibench.model.chebyshev import AffinePolynomial
 from vibench.model.hyperreduced import AnyReducedModel
 from vibench.offline import c_source
 from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, member_polynomials
+from vibench.qp.exact import exact_solution
 from vibench.qp.verification import QPSolution
 from vibench.text import one_line
 
 
 @dataclass(frozen=True)
 class CompiledModel:
-    """Data of the C source of a model: polynomials of A, f, B and g, the box (d,), the accuracy that it verifies."""
+    """Data of the C source of a model: polynomials of A, f, B and g, and the accuracy that it verifies."""
 
     members: Mapping[str, AffinePolynomial]
-    lower: Array
-    upper: Array
-    names: tuple[str, ...]
-    units: tuple[str, ...]
+    # The box, `lower` and `upper` (d,), and those of `first_sets`.
+    arrays: Mapping[str, Array]
     accuracy: float
 
     @classmethod
@@ -53,28 +53,49 @@ class CompiledModel:
             raise UnsupportedError(f"the model cannot be exported to C: {error}") from None
         box, members = reduced.problem.parameters, {name: polynomials[name] for name in MEMBERS}
         # Store polynomials and not the source: who loads an artefact runs nothing that is in it.
-        return cls(members, box.lower, box.upper, box.names, box.units, accuracy)
+        arrays = {"lower": box.lower, "upper": box.upper, **first_sets(reduced.problem, members)}
+        return cls(members, arrays, accuracy)
 
     @property
     def source(self) -> str:
         """The C source; its function is called `model_solve`."""
         about: Mapping[str, Any] = {
-            "parameters": {"names": self.names, "units": self.units}, "exported_by": "vibench",
+            "parameters": {"names": (), "units": ()}, "exported_by": "vibench",
             "cell": dict.fromkeys(("problem", "dual", "primal", "cell"), "of this run"), "accuracy": self.accuracy,
             "source": dict.fromkeys(("distribution", "licence"), "as the problem"),
         }  # fmt: skip
-        return c_source.source(self.members, {"lower": self.lower, "upper": self.upper}, about, "model")[0]
+        return c_source.source(self.members, self.arrays, about, "model")[0]
 
     def program(self) -> CompiledProgram:
         """Compile and load the program; raises an `UnsupportedError` if there is no C compiler, or it fails."""
         return CompiledProgram(self.source, *(self.members[name].terms.shape[1] for name in "fg"))
 
 
+def first_sets(problem: Problem, members: Mapping[str, AffinePolynomial]) -> dict[str, Array]:
+    """Training parameters (P×d), active sets (P×R) of their programs, and the factor of a constant A, packed."""
+    box, training = problem.parameters, training_parameters(problem)
+    # A query begins with the set of the nearest parameter, for which it looks at all of them.
+    training = training[:: -(-len(training) // 512)]
+    values = [members[name].evaluate((training - box.lower) / (box.upper - box.lower)) for name in MEMBERS]
+    sets, size = np.zeros(values[3].shape, bool), values[1].shape[1]
+    for k, (packed, f, B, g) in enumerate(zip(*values, strict=True)):
+        A = np.zeros((size, size))
+        A[np.triu_indices(size)] = packed
+        A += np.triu(A, 1).T
+        if (solved := exact_solution(VariationalInequality(A, f, B.reshape(-1, size), g))) is not None:
+            sets[k] = solved.alpha > 0.0
+    found = {"start_parameters": training, "start_sets": sets}
+    if "A" in problem.constant:
+        found["start_factor"] = np.linalg.cholesky(A).T[np.triu_indices(size)]
+    return found
+
+
 def _refuse_large(program: VariationalInequality) -> None:
     """Raise an `UnsupportedError` if programs of this size have too many arrays on the stack."""
     N, R = len(program.f), len(program.g)
-    # A packed and twice in full, J and U; B and the normals.
-    size = 8 * (5 * N * N + 2 * N * R)
+    # A packed, in full and factorised, and B; then the dual method, or rows, products and factors of the quick one.
+    known = min(R, 2 * N)
+    size = 4 * (5 * N * N + 2 * N * R) + 8 * max(2 * N * N + N * R, known * (N + known // 2) + 2 * N * N)
     # Stacks usually have eight mebibytes, beyond which the process is aborted.
     if size > 4 * 2**20:
         what = f"the program of {N} unknowns and {R} constraints has {size / 2**20:.1f} MiB of arrays on the stack"
@@ -87,20 +108,23 @@ class CompiledProgram:
     def __init__(self, source: str, unknowns: int, constraints: int) -> None:
         # A library that is loaded needs its file no longer.
         with foreign("the C compiler, or what it makes,"), scratch() as folder:
-            self._solve = ctypes.CDLL(str(_compiled(source, folder))).model_solve
+            self._solve = ctypes.CDLL(str(_compiled(source, folder))).model_solve_counting
         self._sizes = unknowns, constraints
-        self._solve.argtypes, self._solve.restype = [ctypes.c_void_p] * 4, ctypes.c_int
+        self._solve.argtypes, self._solve.restype = [ctypes.c_void_p] * 5, ctypes.c_int
 
     def __call__(self, mu: Array) -> QPSolution:
         """The solution at mu (d,), verified by the program alone."""
         at = np.ascontiguousarray(mu, dtype=float)
-        x, alpha, residuals = np.empty(self._sizes[0]), np.empty(self._sizes[1]), np.empty(3)
-        code = self._solve(at.ctypes.data, x.ctypes.data, alpha.ctypes.data, residuals.ctypes.data)
+        x, alpha, residuals, steps = np.empty(self._sizes[0]), np.empty(self._sizes[1]), np.empty(3), ctypes.c_int()
+        pointers = [array.ctypes.data for array in (at, x, alpha, residuals)]
+        code = self._solve(*pointers, ctypes.addressof(steps))
         # The program adds 16 to its code at parameters outside the box.
         outcome = code % 16
         texts = ("solved", "inaccurate", "the constraints contradict each other", "not solved")
         text = texts[outcome] if outcome < len(texts) else f"code {code}"
-        return QPSolution(x, alpha, text) if outcome in {0, 1} else QPSolution(None, None, text)
+        if outcome > 1:
+            return QPSolution(None, None, text)
+        return QPSolution(x, alpha, f"{text} by the dual method" if steps.value < 0 else text, max(steps.value, 0))
 
 
 def compiler() -> list[str]:

@@ -12,7 +12,7 @@ from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.interfaces.validation import training_parameters
 from vibench.model.affine import affine_decomposition, check_affine
-from vibench.model.chebyshev import AffinePolynomial, interpolate_on_box
+from vibench.model.chebyshev import AffinePolynomial, compressed, interpolate_on_box
 from vibench.model.galerkin import projections
 from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, hyper_reduce
 
@@ -53,6 +53,7 @@ def member_polynomials(
         if check is not None:
             check(first)
         terms = declared_terms(queried)
+        shared = rotated and "A" not in terms
         if rotated:
             terms |= {"A": _stiffness_terms(queried, box.lower)} | {name: of.T for name, of in rotated.items()}
         theta_of = {name: "A" if name in rotated else name for name in terms}
@@ -82,6 +83,9 @@ def member_polynomials(
         why = "depends on mu through the code of the problem, which the file cannot hold"
         inaccurate = f"polynomials of degree ({degrees}) reach a relative error of {reached:.1e}, not {tolerance:.0e}"
         raise InaccurateError(f"{worst} {why}, and {inaccurate}", reached)
+    if shared:
+        # The terms of the certificate are not the best for A.
+        polynomials["A"] = compressed(polynomials["A"], tolerance)
     return queried, polynomials
 
 

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 class Compiled(Formulation):
     """The mixed quadratic program as exported C source, compiled when the model is made: needs a C compiler.
 
-    A query is one call, from the parameter to the solution by the dual method of the exported file. The basis must not
-    depend on the parameter.
+    A query is one call, from the parameter to the solution by the active set methods of the exported file. The basis
+    must not depend on the parameter.
     """
 
     uses: ClassVar[tuple[str, ...]] = ("pod", "dual", "primal", "accuracy")
@@ -54,7 +54,7 @@ class CompiledFormulationModel(ProgramModel):
         found = self.call(mu)
         if found.x is None:
             return FormulationAnswer.none(found.solver_status)
-        return FormulationAnswer(found.x, found.alpha, reason=found.solver_status)
+        return FormulationAnswer(found.x, found.alpha, reason=found.solver_status, iterations=found.iterations)
 
 
 @lru_cache(maxsize=32)

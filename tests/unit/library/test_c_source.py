@@ -291,9 +291,9 @@ def test_both_methods_of_the_correction_in_c_find_that_of_vibench(steps: int, tm
         f"enum {{ LOADS = {size}, STEPS = {steps} }};\n"
         "double certificate_inverse[LOADS * LOADS], certificate_responses[LOADS * LOADS];\n"
         f"int certificate_rows[] = {{ {', '.join(map(str, range(size)))} }};\n",
-        basic[basic.index("static double dot(") : basic.index("/* The largest of two")],
-        text[text.index("static const double *inverse_row(") : text.index("static double dot_sizes(")],
-        text[text.index("static double dot_sizes(") : text.index("/* A w with B w >= s")].replace("static", ""),
+        basic[basic.index("#define SUM(") : basic.index("/* Whether all numbers are finite")],
+        text[text.index("static const double *inverse_row(") : text.index("/* out of M_kk")],
+        text[text.index("/* out of M_kk") : text.index("/* A w with B w >= s")].replace("static", ""),
     ]
     (tmp_path / "part.c").write_text("".join(parts), encoding="utf-8")
     found = library(tmp_path / "part.c", strict=())
@@ -398,7 +398,7 @@ def test_loaded_ties_hide_no_contact_from_c_and_scripts(share: float, tmp_path: 
     members = {"A": linear(A[np.triu_indices(5)], {}, 1), "f": linear(f, {}, 1), "B": linear(B, {}, 1)}
     members["g"] = linear(g, {}, 1)
     text = c_source.source(members, {"lower": np.zeros(1), "upper": np.ones(1)}, about(["t"]), "case")[0]
-    judged = "    return verify(&set"
+    judged = "        status = verify(&p"
     spoilt = text.replace(judged, f"    alpha[0] *= {share};\n    alpha[1] *= {share};\n{judged}")
     (tmp_path / "case.c").write_text(spoilt, encoding="utf-8")
     code, x, alpha, found = compiled(tmp_path / "case.c", 5, 5)(np.zeros(1))

@@ -459,11 +459,10 @@ def certified_model(run: vibench.Run, problem: str = "radial-obstacle") -> viben
 
 def test_exported_members_and_their_certificate(run: vibench.Run) -> None:
     obstacle, model = certified_model(run, "obstacle"), certified_model(run)
-    # one polynomial serves A and its certificate
+    # A needs fewer products in its own terms than its certificate
     found = exported_model(obstacle, bases=False, c=True)
     A, theta = found.members["A"], found.thetas["theta_A"]
-    assert np.array_equal(A.indices, theta.indices)
-    assert np.array_equal(A.coefficients, theta.coefficients)
+    assert len(A.indices) < len(theta.indices)
     assert max(A.error, theta.error) <= 1e-11
     # a file without bounds says why
     for exported, c, why in (

@@ -70,7 +70,7 @@ def test_compiled_cells_have_the_rows_of_reduced_ones_and_are_no_solver(run: vib
 def test_a_crash_costs_its_query_alone(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     heights = run.table("queries").groupby("query")["mu_1"].first().sort_values()
     crash = f"if (mu[0] > {heights.iloc[-2]:.17g}) __builtin_trap();"
-    edit = rf"sed -i '/^int model_solve/,$ s/    Set set;/    Set set; {crash}/' model.c"
+    edit = rf"sed -i '/^int model_solve_counting/,$ s/    Program p;/    Program p; {crash}/' model.c"
     monkeypatch.setenv("CC", script(tmp_path, f'{edit}\nexec cc "$@"'))
     study = small_study("compiled", STUDY.problem, formulation=["compiled"], accuracy=1e-7, validation=4)
     queries = vibench.run(study, tmp_path / "run", progress=False, jobs=1).table("queries").set_index("query")
@@ -108,7 +108,7 @@ def small_model(**members: np.ndarray) -> CompiledModel:
     values = {"A": np.array([1.0, 0.0, 1.0]), "f": np.array([1.0, 0.0]), "B": LIMITS, "g": np.array([0.25, 1.0])}
     values |= members
     polynomials = {name: polynomial(values[name], 0.2 if name == "g" else 0.0) for name in MEMBERS}
-    return CompiledModel(polynomials, np.zeros(2), np.ones(2), ("s", "t"), ("1", "m"), 1e-9)
+    return CompiledModel(polynomials, {"lower": np.zeros(2), "upper": np.ones(2)}, 1e-9)
 
 
 def test_programs_answer_say_what_they_cannot_and_are_repeated_near_by() -> None:
