@@ -36,7 +36,7 @@ def test_too_many_jobs_or_too_few_files_are_said(main: Main, tmp_path: Path, mon
     assert refused(main("run", study, "--executor", "dask", "--jobs", "2")) == f"vibench: {line}"
 
 
-@pytest.mark.skipif(solver_version("daqp") != "", reason="daqp is installed")
+@pytest.mark.skipif(solver_version("ecos") != "", reason="ecos is installed")
 def test_a_run_does_not_depend_on_asserts_letters_of_an_encoding_nor_folders_called_like_a_library(
     command: str, plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -46,17 +46,17 @@ def test_a_run_does_not_depend_on_asserts_letters_of_an_encoding_nor_folders_cal
     """
     for name, value in {"PYTHONOPTIMIZE": "1", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "LC_ALL": "C"}.items():
         monkeypatch.setenv(name, value)
-    (tmp_path / "daqp").mkdir()  # can be imported
+    (tmp_path / "ecos").mkdir()  # can be imported
     (tmp_path / "piqp").mkdir()
     (tmp_path / "piqp" / "__init__.py").write_text("raise OSError('not the solver')")
-    write_study(tmp_path, wire_study(solvers=["piqp", "daqp", "careful"]))
+    write_study(tmp_path, wire_study(solvers=["piqp", "ecos", "careful"]))
     run = [command, "run", "study.toml", "--jobs", "1", "--no-figures"]
     with started(run, tmp_path, Path(f"{plugins_folder}:")) as process:
         printed, errors = process.communicate(timeout=PATIENCE)
     assert (process.returncode, errors) == (0, "")
     assert "[3/3] ok: wire" in printed
     found = {solver: row["status"] for solver, row in by_solver(tmp_path / "runs" / "wire").items()}
-    assert found == {"piqp": "ok", "careful": "ok", "daqp": "unavailable"}
+    assert found == {"piqp": "ok", "careful": "ok", "ecos": "unavailable"}
 
 
 def test_a_distribution_with_unreadable_entry_points_costs_its_own(

@@ -35,7 +35,7 @@ from vibench.offline.reduction import Reduction, high_fidelity_sweep
 from vibench.offline.solution import Solution
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import find, qp_solver
-from vibench.qp.solve import solve_qp
+from vibench.qp.solve import form_of, solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
 from vibench.reduction.cones import project_on_cone
@@ -351,9 +351,11 @@ def test_solver(timing: Timing, inputs: StageInputs, size: Size, solver: str, ac
     def judge(answer: QPSolution) -> Info:
         status, reason, residuals = verify(reduced.program, answer, accuracy)
         figures = {} if residuals is None else residual_figures(residuals)
-        return {**_shape(reduced), "N": N, "status": status.value, "reason": reason, "accuracy": figures}
+        shape = {**_shape(reduced), "form": form_of(solver, reduced.factor, extra)}
+        return {**shape, "N": N, "status": status.value, "reason": reason, "accuracy": figures}
 
-    solve = partial(solve_qp, reduced.program, solver, accuracy, qp_solver(solver), reduced.factor)
+    extra = qp_solver(solver)
+    solve = partial(solve_qp, reduced.program, solver, accuracy, extra, reduced.factor)
     timing(f"QP of N = {N}, R = {R}", solve, judge)
 
 

@@ -115,7 +115,7 @@ class Reduction:
     training: Sampling | None = None
     assembly: Assembly = "full"
     interpolation: Share = INTERPOLATION_RTOL
-    solver: str = "piqp"
+    solver: str = "daqp"
     accuracy: Share = 1e-9
     formulation: Formulation | None = None
     bounds: bool = False

@@ -89,7 +89,7 @@ SETTINGS: Mapping[str, SolverSettings] = {
     ),
     "daqp": SolverSettings(
         lambda accuracy: {"primal_tol": 0.005 * accuracy, "dual_tol": 0.005 * accuracy, "zero_tol": 1e-14},
-        iterations="iterations", start=_primal_start, bounds=True,
+        iterations="iterations", start=_primal_start,
     ),
     "quadprog": SolverSettings(lambda _: {}, iterations="iterations"),
     # HiGHS accepts no smaller tolerance than 1e-10.

@@ -11,11 +11,11 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cache, partial
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.linalg.lapack import dposv, dtrtrs
+from scipy.linalg.lapack import dposv, dpotrf, dtrtrs
 
 from vibench.arrays import Array, Mask
 from vibench.errors import NumericalError, UnsupportedError, foreign, in_a_line, message_of, unknown_name
@@ -28,20 +28,10 @@ from vibench.qp.verification import QPSolution, QPSolver
 from vibench.signatures import Share
 from vibench.text import one_line
 
-if TYPE_CHECKING:
-    import qpsolvers
+T = TypeVar("T")
 
 
-class DirectSolution(NamedTuple):
-    """A solver's answer, as `qpsolvers.Solution` names it; x (n,) and z (m,) are `None` where it found nothing."""
-
-    x: Array | None
-    z: Array | None
-    found: bool
-    extras: Mapping[str, Any]
-
-
-def _piqp(program: VariationalInequality, bounds: bool = False, **settings: Any) -> DirectSolution:
+def _piqp(program: VariationalInequality, bounds: bool = False, **settings: Any) -> QPSolution:
     import piqp  # noqa: PLC0415  an optional solver
 
     solver = piqp.DenseSolver()
@@ -53,30 +43,14 @@ def _piqp(program: VariationalInequality, bounds: bool = False, **settings: Any)
         solver.setup(np.asfortranarray(program.A), -program.f, G=np.asfortranarray(program.B), h_u=program.g)
     status, result = solver.solve(), solver.result
     z = np.array(result.z_bl if bounds else result.z_u)
-    return DirectSolution(np.array(result.x), z, status == piqp.PIQP_SOLVED, {"info": result.info})
-
-
-def _daqp(
-    program: VariationalInequality, bounds: bool = False, initvals: Array | None = None, **settings: Any
-) -> DirectSolution:
-    import daqp  # noqa: PLC0415  an optional solver
-
-    # DAQP takes 1e30 for no bound on this side.
-    B, lower, upper = program.B, np.full(len(program.g), -1e30), program.g
-    if bounds:
-        B, lower, upper = np.zeros((0, len(program.g))), -program.g, np.full(len(program.g), 1e30)
-    kinds = np.zeros(len(program.g), dtype=np.int32)
-    x, _, outcome, info = daqp.solve(program.A, -program.f, B, upper, lower, kinds, primal_start=initvals, **settings)
-    if outcome <= 0:
-        return DirectSolution(None, None, found=False, extras={})
-    return DirectSolution(x, -info["lam"] if bounds else info["lam"], found=True, extras={})
+    return QPSolution(np.array(result.x), z, str(status), int(result.info.iter))
 
 
 # Solvers that take dense programs without qpsolvers, whose checks and conversions cost a third of a small program.
 # Every program gets a solver object of its own: updated in place, it would keep what it adapted to the program before
 # (step sizes, equilibration), and answers would depend on earlier programs of the process, by up to 1e-5. Where
 # `bounds` is set B is minus the identity, and bounds take these solvers less time than rows.
-DIRECT: Mapping[str, Callable[..., DirectSolution]] = {"piqp": _piqp, "daqp": _daqp}
+DIRECT: Mapping[str, Callable[..., QPSolution]] = {"piqp": _piqp}
 
 
 def solve_qp(
@@ -90,6 +64,9 @@ def solve_qp(
     A dense program is shifted by A⁻¹f before: its size is what contact does then, not the load.
     Constraints at a distance of more than 1e4 units are left out at first, and restored if the solution violates one of
     them. The solution is scaled back.
+
+    DAQP is given dense programs as least distance problems instead, whose scale is that of the residuals
+    (`_least_distance`): at all sizes that costs less than the primal or the dual form, which it would transform itself.
 
     The program is dense, or sparse for solvers that take sparse data. `solver` is a name that qpsolvers knows, or one
     of `extra`, those registered through the entry point group `vibench.qp_solvers`. The relative `accuracy` is
@@ -105,14 +82,9 @@ def solve_qp(
         return _unconstrained(program, factor)
     if not program.f.any() and (program.g >= 0.0).all():
         return QPSolution(np.zeros_like(program.f), np.zeros_like(program.g), "nothing to solve: no constraint acts")
-    if factor is None and isinstance(program.A, np.ndarray) and program.f.any():
-        L, free, failed = dposv(program.A, program.f)
-        # An A of which a pivot leaves next to nothing is left to the solver: A⁻¹f would be round-off.
-        if not failed and (np.square(L.diagonal()) > 1e-10 * program.A.diagonal()).all():
-            shifted = replace(program, f=np.zeros_like(free), g=program.g - program.B @ free)
-            begun = start if start is None or start.x is None else replace(start, x=start.x - free)
-            answer = solve_qp(shifted, solver, accuracy, extra, start=begun)
-            return answer if answer.x is None else replace(answer, x=answer.x + free)
+    found = _solve_shifted(program, solver, accuracy, extra, factor, start)
+    if found is not None:
+        return found
     rows = row_norms(program.B)
     driven = drive(program, rows)
     kept = near(program, rows, driven)
@@ -124,6 +96,26 @@ def solve_qp(
     if factor is None or not len(program.f):
         return solve(units_driven(rows, driven), program, start)
     return _solve_dual(program, solve, factor, start, rows, driven.loaded)
+
+
+def _solve_shifted(
+    program: VariationalInequality, solver: str, accuracy: float, extra: Mapping[str, QPSolver] | None,
+    factor: Array | None, start: QPSolution | None,
+) -> QPSolution | None:  # fmt: skip
+    """Solve a dense program as a least distance problem, or shifted by A⁻¹f; `None` for neither."""
+    if not (isinstance(program.A, np.ndarray) and len(program.f)):
+        return None
+    if form_of(solver, factor, extra) == "least distance":
+        return _or_its_error(partial(_least_distance, program, SETTINGS[solver].at(accuracy), factor, start))
+    if factor is not None or not program.f.any():
+        return None
+    L, free, failed = dposv(program.A, program.f)
+    if failed or not _is_definite(L, program.A):
+        return None
+    shifted = replace(program, f=np.zeros_like(free), g=program.g - program.B @ free)
+    begun = start if start is None or start.x is None else replace(start, x=start.x - free)
+    answer = solve_qp(shifted, solver, accuracy, extra, start=begun)
+    return answer if answer.x is None else replace(answer, x=answer.x + free)
 
 
 def _solve_near(
@@ -168,15 +160,8 @@ def _solve_in(
     warm_start, starter = dict[str, Any](), None if extra and solver in extra else SETTINGS[solver].start
     if start is not None and starter is not None and start.x is not None and start.alpha is not None:
         warm_start |= starter(*units.to(start.x, start.alpha))
-    try:
-        if extra and solver in extra:
-            answer = extra[solver](scaled, accuracy)
-        else:
-            answer = _call(scaled, solver, accuracy, warm_start, bounds)
-    except MemoryError:
-        raise
-    except Exception as error:  # noqa: BLE001  a solver may raise anything, and others go on
-        return QPSolution(None, None, in_a_line(error))
+    call = partial(_call, scaled, solver, accuracy, warm_start, bounds)
+    answer = _or_its_error(partial(extra[solver], scaled, accuracy) if extra and solver in extra else call)
     if not isinstance(answer, QPSolution):
         raise NumericalError(f"the solver returned a {type(answer).__name__}, expected a QPSolution")
     status, iterations = _report(answer, program)
@@ -184,6 +169,16 @@ def _solve_in(
         return QPSolution(None, None, status, iterations, answer.negative)
     x, alpha = units.back(answer.x, answer.alpha)
     return QPSolution(x, np.maximum(alpha, 0.0), status, iterations, -float(alpha.min(initial=0.0)))
+
+
+def _or_its_error(solve: Callable[[], T]) -> T | QPSolution:
+    """What a solver returns, or an answer without x whose status is what it raises."""
+    try:
+        return solve()
+    except MemoryError:
+        raise
+    except Exception as error:  # noqa: BLE001  a solver may raise anything, and others go on
+        return QPSolution(None, None, in_a_line(error))
 
 
 def _report(answer: QPSolution, program: VariationalInequality) -> tuple[str, int | None]:
@@ -207,18 +202,12 @@ def _solve_dual(
 
     The multipliers minimise ½ αᵀ(B A⁻¹Bᵀ)α − (B A⁻¹f − g)ᵀα over α ≥ 0; then x = A⁻¹(f − Bᵀα).
     """
-    count = len(program.g)
-    right = np.empty((count + 1, len(program.f)))
     # Scale rows before products are taken: the matrix of the dual has their squares.
-    np.divide(program.B, rows[:, None], out=right[:count])
-    right[count] = program.f
-    whitened = _solve_factor(factor, right.T)
-    constraints, load = whitened[:, :count], whitened[:, count]
-    A, f = constraints.T @ constraints, constraints.T @ load - program.g / rows
+    constraints, load = _whitened(program, factor, rows[:, None])
+    A, f = constraints @ constraints.T, constraints @ load - program.g / rows
     if not (f > 0.0).any():
-        # The unconstrained solution satisfies all constraints.
-        x = _solve_factor(factor, load, transposed=True)
-        return QPSolution(x, np.zeros(count), "nothing to solve: no constraint acts")
+        return _unpressed(program, factor, load)
+    count = len(program.g)
     dual = VariationalInequality(A, f, B=-np.eye(count), g=np.zeros(count))
     if start is not None and start.alpha is not None and start.x is not None:
         # The multipliers of the constraints −α ≤ 0 are the slacks g − Bx.
@@ -228,9 +217,61 @@ def _solve_dual(
     if answer.x is None:
         return answer
     forces = np.maximum(answer.x, 0.0)
-    x = _solve_factor(factor, load - constraints @ forces, transposed=True)
+    x = _solve_factor(factor, load - forces @ constraints, transposed=True)
     negative = -float((answer.x / rows).min(initial=0.0))
     return QPSolution(x, forces / rows, answer.solver_status, answer.iterations, negative)
+
+
+def _least_distance(
+    program: VariationalInequality, settings: Mapping[str, Any], factor: Array | None, start: QPSolution | None
+) -> QPSolution | None:
+    """Solve a dense program with A = L Lᵀ as DAQP does inside, with the help of LAPACK; `None` if A is hardly definite.
+
+    For y = Lᵀx − L⁻¹f it is min ½|y|² subject to K y ≤ g − K L⁻¹f, where K = B L⁻ᵀ. DAQP scales rows of K to length 1:
+    with the deepest violation at y = 0 as the unit its tolerances are those of the natural residuals.
+    """
+    import daqp  # noqa: PLC0415  processes that use it alone load it
+
+    if factor is None:
+        factor, failed = dpotrf(program.A.T, lower=True)
+        if failed or not _is_definite(factor, program.A):
+            return None
+    K, load = _whitened(program, factor, 1.0)
+    depths = K @ load - program.g
+    if (deepest := float((depths / row_norms(K)).max())) <= 0.0:
+        return _unpressed(program, factor, load)
+    active = np.zeros(len(K), np.int32)
+    if start is not None and start.alpha is not None:
+        active = (start.alpha > 0.0).astype(np.int32)
+    # DAQP takes no matrix for the identity, and 1e30 for no bound on this side.
+    bounds = depths / -deepest, np.full(len(K), -1e30)
+    _, _, outcome, info = daqp.solve(None, None, K, *bounds, active, **settings)
+    if outcome <= 0:
+        return QPSolution(None, None, f"not found: exit flag {outcome}")
+    multipliers = deepest * info["lam"]
+    alpha = np.maximum(multipliers, 0.0)
+    x = _solve_factor(factor, load - alpha @ K, transposed=True)
+    return QPSolution(x, alpha, "found", int(info["iterations"]), -float(multipliers.min(initial=0.0)))
+
+
+def _is_definite(L: Array, A: Array) -> bool:
+    """Whether no pivot of A = L Lᵀ leaves next to nothing of it: A⁻¹f would be round-off."""
+    return bool((np.square(L.diagonal()) > 1e-10 * A.diagonal()).all())
+
+
+def _whitened(program: VariationalInequality, L: Array, rows: Array | float) -> tuple[Array, Array]:
+    """B L⁻ᵀ (m×n), its rows over `rows` (m×1), and L⁻¹f (n,), in one solve."""
+    right = np.empty((len(program.g) + 1, len(program.f)))
+    np.divide(program.B, rows, out=right[:-1])
+    right[-1] = program.f
+    whitened = _solve_factor(L, right.T).T
+    return whitened[:-1], whitened[-1]
+
+
+def _unpressed(program: VariationalInequality, factor: Array, load: Array) -> QPSolution:
+    """The solution A⁻¹f from L⁻¹f (n,), which satisfies all constraints."""
+    x = _solve_factor(factor, load.copy(), transposed=True)
+    return QPSolution(x, np.zeros_like(program.g), "nothing to solve: no constraint acts")
 
 
 def _solve_factor(L: Array, right: Array, *, transposed: bool = False) -> Array:
@@ -274,6 +315,16 @@ def load_qpsolvers() -> tuple[Any, Mapping[str, str]]:
     return qpsolvers, faults
 
 
+def form_of(solver: str, factor: Array | None, extra: Iterable[str] | None = ()) -> str:
+    """The form in which a solver is given dense programs: "primal", "dual" or "least distance".
+
+    It is the last one for DAQP; for other solvers the dual, where the Cholesky factor of A is known.
+    """
+    if solver == "daqp" and solver not in (extra or ()):
+        return "least distance"
+    return "primal" if factor is None else "dual"
+
+
 def takes_start(solver: str) -> bool:
     """Whether a solver can be warm-started."""
     return solver in SETTINGS and SETTINGS[solver].start is not None
@@ -287,24 +338,20 @@ def _call(
     Where B is minus the identity the constraints are `bounds`, which some solvers are given as such.
     """
     settings, bounds = SETTINGS[solver].at(accuracy), bounds and SETTINGS[solver].bounds
-    solution: DirectSolution | qpsolvers.Solution
     if solver in DIRECT and isinstance(program.A, np.ndarray) and isinstance(program.B, np.ndarray):
-        solution = DIRECT[solver](program, bounds, **settings, **start)
-    else:
-        library, _ = load_qpsolvers()
-        rows = {"lb": -program.g} if bounds else {"G": _as_csc(program.B), "h": program.g}
-        problem = library.Problem(_as_csc(program.A), -program.f, **rows)
-        with warnings.catch_warnings():
-            # Warnings repeat the status, which is part of the solution and is verified later.
-            warnings.simplefilter("ignore")
-            solution = library.solve_problem(problem, solver=solver, **settings, **start)
+        return DIRECT[solver](program, bounds, **settings, **start)
+    library, _ = load_qpsolvers()
+    rows = {"lb": -program.g} if bounds else {"G": _as_csc(program.B), "h": program.g}
+    problem = library.Problem(_as_csc(program.A), -program.f, **rows)
+    with warnings.catch_warnings():
+        # Warnings repeat the status, which is part of the solution and is verified later.
+        warnings.simplefilter("ignore")
+        solution = library.solve_problem(problem, solver=solver, **settings, **start)
     status, iterations = SETTINGS[solver].report(solution)
-    z = solution.z
-    if bounds and not isinstance(solution, DirectSolution):
-        z = None if solution.z_box is None else -solution.z_box
-    if solution.x is None or z is None:
+    x, z = solution.x, solution.z_box if bounds else solution.z
+    if x is None or z is None:
         return QPSolution(None, None, status, iterations)
-    return QPSolution(np.asarray(solution.x, float), np.asarray(z, float), status, iterations)
+    return QPSolution(np.asarray(x, float), np.asarray(-z if bounds else z, float), status, iterations)
 
 
 def _as_csc(matrix: Any) -> Any:

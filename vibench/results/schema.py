@@ -259,7 +259,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "cell": _cell(),
         **KEYS,
         "query": integer("Number of the validation parameter, from 0."),
-        "form": text("Form in which the program was solved: primal, dual, or compiled; formulation for plugins."),
+        "form": text("Form in which it was solved: primal, dual, least distance or compiled; formulation for plugins."),
         "started_from": integer("Query from whose solution the solver started; empty for a cold start."),
         "assembly_error": real("1", "Largest relative difference of a member of the program from its projection."),
         "assemble_s": real("s", "Assembly of the reduced program: median over the rounds."),

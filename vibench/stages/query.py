@@ -18,7 +18,7 @@ from vibench.interfaces.strategies import Kind
 from vibench.offline.models import CellSolver, Model, QueryStatus
 from vibench.plugins import registry
 from vibench.qp.scaling import in_units, nearby, random_units
-from vibench.qp.solve import solve_qp, takes_start
+from vibench.qp.solve import form_of, solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import RECOGNISED, QPSolution, check_answer, slack, verify
 from vibench.results.consistency import solution_row
@@ -59,7 +59,7 @@ class ProgramQuery:
 
     @property
     def form(self) -> str:
-        return "primal" if self.factor is None else "dual"
+        return form_of(self.solver, self.factor, registry.qp_solver(self.solver))
 
     def in_model(self, x: Array) -> Array:
         """Coordinates (n,) of the model from those of an answer."""

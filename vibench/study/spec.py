@@ -302,7 +302,7 @@ class Study(_Model):
         default_factory=lambda: [FormulationEntry(name=default_formulation())],
         description="Formulations; `mixed` is the program of V_N and the cone. None has axes that it does not use.",
     )
-    solvers: Solvers = Field(default=[], description="QP solvers; `available` for all installed. Required by `mixed`.")
+    solvers: Solvers = Field(default=[], description="QP solvers; `available` for all installed. By default `daqp`.")
     dual: Annotated[list[Entry], MinLen(1)] = Field(default=[], description="Dual strategies. Required by `mixed`.")
     primal: Annotated[list[Entry], MinLen(1)] = Field(default=[], description="Primal strategies. Required by `mixed`.")
     assembly: Annotated[list[Literal["full", "reduced"]], MinLen(1)] = Field(

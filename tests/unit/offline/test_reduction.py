@@ -33,15 +33,14 @@ def test_a_reduction_answers_as_the_run_of_the_same_study(
 ) -> None:
     rows = with_ways(small_run.cells).set_index(["problem", "primal", "assembly"])
     row = rows.loc[(PROBLEM["name"], primal, assembly)]
-    certified = assembly == "certified"
+    certified, theirs = assembly == "certified", small_run.model(row["cell"])
     reduction = reduce(
         primal=vibench.create("primal strategy", primal), tolerance=0.5 if primal == "offline-pga" else None,
         assembly="reduced" if certified else "full", bounds=certified,
-        interpolation=SMALL.interpolation, accuracy=SMALL.accuracy[0],
+        interpolation=SMALL.interpolation, accuracy=SMALL.accuracy[0], solver=theirs.solver,
     ).given(snapshots=snapshots)  # fmt: skip
     assert (reduction.pod.basis.shape[1], reduction.cone.size) == (row["N"], row["R"])
     assert reduction.enrichment.kind == row["enrichment_kind"]
-    theirs = small_run.model(row["cell"])
     for mu in reduction.problem.validation_set(3, 1):
         one, other = reduction.model.solve(mu), theirs.solve(mu)
         assert one.status == other.status == "ok"

@@ -135,7 +135,7 @@ def test_a_program_without_load_is_solved_to_the_accuracy_asked_for(solver: str,
         assert np.allclose(vi.B.T @ answer.alpha, force * (vi.B.T @ alpha), rtol=0.0, atol=1e-4 * force)
 
 
-@pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
+@pytest.mark.parametrize("solver", ["daqp", "piqp", "proxqp", "osqp"])
 @pytest.mark.parametrize("form", ["primal", "dual"])
 def test_without_load_and_contact_or_nearly_so_a_solution_is_ok(solver: str, form: str) -> None:
     """The x and α are zero, or small beside g: residuals relative to them would be those of round-off."""
@@ -159,7 +159,7 @@ def test_a_constraint_that_was_left_out_is_brought_back_where_it_matters() -> No
         assert verification.verify(vi, answer, 1e-8)[0] is Status.FAILED
 
 
-@pytest.mark.parametrize("solver", ["proxqp", "osqp"])
+@pytest.mark.parametrize("solver", ["daqp", "proxqp", "osqp"])
 @pytest.mark.parametrize("form", ["primal", "dual"])
 def test_a_start_without_load_is_in_the_same_units(solver: str, form: str) -> None:
     vi = indentation(2, -3, 6)

@@ -68,7 +68,7 @@ def test_rows_say_which_query_of_the_path_they_started_from(tmp_path: Path) -> N
     assert started[True, "osqp"].count(None) == 1
 
 
-@pytest.mark.parametrize(("solver", "dual"), [*product(["piqp", "proxqp", "osqp"], [False, True])])
+@pytest.mark.parametrize(("solver", "dual"), [*product(["daqp", "piqp", "proxqp", "osqp"], [False, True])])
 def test_a_start_changes_the_way_and_not_the_answer(solver: str, dual: bool) -> None:
     rng = np.random.default_rng(2)
     A = np.diag(1.0 + rng.random(5))
