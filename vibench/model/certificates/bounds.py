@@ -401,7 +401,7 @@ def _sampled(
     # up to 200 samples, and a correction of every eighth: only medians and maxima of them are used
     for number, mu in enumerate(mus[:: -(-len(mus) // 200)]):
         reduced = model.assemble(mu)
-        answer = solve_qp(reduced.program, "piqp", 1e-8, factor=reduced.factor)
+        answer = solve_qp(reduced.program, "daqp", 1e-8, factor=reduced.factor)
         if answer.x is None or answer.alpha is None or not np.all(np.isfinite(answer.x)):
             continue
         evaluated, alpha = reduced.evaluated, np.maximum(answer.alpha, 0.0)
