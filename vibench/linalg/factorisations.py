@@ -119,8 +119,8 @@ class _Pardiso(Implementation):
 
 
 class _Cholmod(Implementation):
-    name, summary, distribution = "cholmod", "CHOLMOD, supernodal", "kvxopt"
-    module = "kvxopt.cholmod"
+    name, summary, distribution = "cholmod", "CHOLMOD, supernodal", "cvxopt"
+    module = "cvxopt.cholmod"
 
     def _factor(self, matrix: SparseMatrix, name: str) -> Factor:
         return CholmodFactor(matrix, name)
@@ -130,7 +130,7 @@ class CholmodFactor(Factor):
     """A supernodal Cholesky factor by CHOLMOD of SuiteSparse."""
 
     def __init__(self, matrix: SparseMatrix, name: str) -> None:
-        from kvxopt import base, cholmod  # noqa: PLC0415  an optional library
+        from cvxopt import base, cholmod  # noqa: PLC0415  an optional library
 
         lower, self._library, self._dense = sp.coo_array(sp.tril(matrix)), cholmod, base.matrix
         rows, columns = lower.coords

@@ -93,7 +93,7 @@ def test_solvers_that_cannot_be_run(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_libraries_that_are_missing_and_unsteady_machines_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     needed, known = doctor.required_distributions(), provenance.distribution_version
     assert needed["numpy"] == needed["qpsolvers"] == needed["daqp"] == []
-    assert (needed["ecos"], needed["cvxopt"]) == (["solvers"], ["solvers", "test"])
+    assert (needed["ecos"], needed["cvxopt"]) == (["solvers"], ["fast", "solvers", "test"])
     monkeypatch.setattr(provenance, "distribution_version", lambda name: "" if name == "scipy" else known(name))
     found = by_subject(list(doctor.check_versions()))
     assert found["scipy"].health is Health.BROKEN
