@@ -31,27 +31,25 @@ class MovedMesh:
         number[free] = np.arange(len(free))
         numbers = number[triangles]
         rows, columns = np.repeat(numbers, 3, axis=0).ravel(), np.tile(numbers, (3, 1)).ravel()
-        self._pairs, self._starts, keys = _gathered(rows * len(free) + columns, (rows >= 0) & (columns >= 0))
-        self._corners, self._first, _ = _gathered(numbers.ravel(), numbers.ravel() >= 0)
+        self._pairs, keys = _summing(rows * len(free) + columns, (rows >= 0) & (columns >= 0))
+        self._corners, _ = _summing(numbers.ravel(), numbers.ravel() >= 0)
         self._columns = (keys % len(free)).astype(np.int32)
         self._ends = np.searchsorted(keys // len(free), np.arange(len(free) + 1)).astype(np.int32)
 
     def forms(self, points: Array) -> tuple[SparseMatrix, Array]:
         """The stiffness matrix (n×n) and the load vector (n,) of nodes at `points` (2×nodes)."""
         products, areas = _on_triangles(points[:, self._triangles])
-        stiffness = np.add.reduceat(products.ravel()[self._pairs], self._starts)
-        load = np.add.reduceat(np.tile(areas / 3.0, 3)[self._corners], self._first)
+        stiffness, load = self._pairs @ products.ravel(), self._corners @ np.tile(areas / 3.0, 3)
         # copies, since libraries sort indices in place
         matrix = sp.csr_array((stiffness, self._columns.copy(), self._ends.copy()), shape=2 * load.shape)
         return matrix, np.asarray(load)
 
 
-def _gathered(keys: Indices, kept: NDArray[np.bool_]) -> tuple[Indices, Indices, Indices]:
-    """Positions of the kept keys in rising order, where a new key begins among them, and these keys."""
+def _summing(keys: Indices, kept: NDArray[np.bool_]) -> tuple[SparseMatrix, Indices]:
+    """The matrix that sums the entries of each kept key, in rising order, and these keys."""
     positions = np.flatnonzero(kept)
-    positions = positions[np.argsort(keys[positions], kind="stable")]
-    distinct, starts = np.unique(keys[positions], return_index=True)
-    return positions, starts, distinct
+    distinct, places = np.unique(keys[positions], return_inverse=True)
+    return sp.csr_array((np.ones(len(positions)), (places, positions)), shape=(len(distinct), len(keys))), distinct
 
 
 class TriangleForms:
@@ -74,7 +72,7 @@ class TriangleForms:
 
 def _on_triangles(corners: Array) -> tuple[Array, Array]:
     """e_i · e_j / (4 |T|) (3×3×t) and |T| (t,) of triangles with these corners (2×3×t)."""
-    x, y = np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1)
+    x, y = corners.take([1, 2, 0], axis=1) - corners.take([2, 0, 1], axis=1)
     areas = 0.5 * np.abs(x[0] * y[1] - x[1] * y[0])
     return (x[:, None] * x + y[:, None] * y) / (4.0 * areas), areas
 
