@@ -293,7 +293,3 @@ def _be(request: Mapping[str, Any], files: Sequence[int]) -> None:
             with contextlib.suppress(OSError, ValueError):
                 stream.flush()
         os._exit(code)
-
-
-if __name__ == "__main__":
-    main()

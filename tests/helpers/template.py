@@ -11,7 +11,8 @@ from functools import cache
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
-FORKING = Path(__file__).with_name("forking.py")
+# A process that multiprocessing starts runs the main file of its parent again, if that has one.
+FORKING = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from forking import main; main()"
 
 TEMPLATE = "VIBENCH_TESTS_TEMPLATE"
 """Variable of the environment: the address of a template process that another process has started."""
@@ -35,7 +36,7 @@ def _started() -> str:
         environment = {name: value for name, value in os.environ.items() if name not in left_out}
         environment |= {"PYTHONPATH": os.pathsep.join(paths()), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         process = subprocess.Popen(
-            [sys.executable, str(FORKING), str(theirs.fileno()), address], env=environment,
+            [sys.executable, "-c", FORKING, str(theirs.fileno()), address], env=environment,
             pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True,
         )  # fmt: skip
     assert ours.recv(1) == b"+"

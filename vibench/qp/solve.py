@@ -30,6 +30,8 @@ from vibench.text import one_line
 
 T = TypeVar("T")
 
+FREE = "nothing to solve: no constraint acts"
+
 
 def _piqp(program: VariationalInequality, bounds: bool = False, **settings: Any) -> QPSolution:
     import piqp  # noqa: PLC0415  an optional solver
@@ -65,8 +67,7 @@ def solve_qp(
     Constraints at a distance of more than 1e4 units are left out at first, and restored if the solution violates one of
     them. The solution is scaled back.
 
-    DAQP is given dense programs as least distance problems instead, whose scale is that of the residuals
-    (`_least_distance`): at all sizes that costs less than the primal or the dual form, which it would transform itself.
+    DAQP is given dense programs as least distance problems (`_least_distance`), which it would make of them itself.
 
     The program is dense, or sparse for solvers that take sparse data. `solver` is a name that qpsolvers knows, or one
     of `extra`, those registered through the entry point group `vibench.qp_solvers`. The relative `accuracy` is
@@ -81,7 +82,7 @@ def solve_qp(
     if not len(program.g):
         return _unconstrained(program, factor)
     if not program.f.any() and (program.g >= 0.0).all():
-        return QPSolution(np.zeros_like(program.f), np.zeros_like(program.g), "nothing to solve: no constraint acts")
+        return QPSolution(np.zeros_like(program.f), np.zeros_like(program.g), FREE)
     found = _solve_shifted(program, solver, accuracy, extra, factor, start)
     if found is not None:
         return found
@@ -94,7 +95,10 @@ def solve_qp(
             return found
     solve = partial(_solve_in, solver=solver, accuracy=accuracy, extra=extra)
     if factor is None or not len(program.f):
-        return solve(units_driven(rows, driven), program, start)
+        answer = solve(units_driven(rows, driven), program, start)
+        hardly = form_of(solver, factor, extra) == "least distance" and isinstance(program.A, np.ndarray)
+        note = "; in the primal form, as A is hardly definite" * hardly
+        return replace(answer, solver_status=f"{answer.solver_status}{note}")
     return _solve_dual(program, solve, factor, start, rows, driven.loaded)
 
 
@@ -172,7 +176,7 @@ def _solve_in(
 
 
 def _or_its_error(solve: Callable[[], T]) -> T | QPSolution:
-    """What a solver returns, or an answer without x whose status is what it raises."""
+    """The answer of a solver, or one without x whose status is the error that it raises."""
     try:
         return solve()
     except MemoryError:
@@ -206,9 +210,8 @@ def _solve_dual(
     constraints, load = _whitened(program, factor, rows[:, None])
     A, f = constraints @ constraints.T, constraints @ load - program.g / rows
     if not (f > 0.0).any():
-        return _unpressed(program, factor, load)
-    count = len(program.g)
-    dual = VariationalInequality(A, f, B=-np.eye(count), g=np.zeros(count))
+        return QPSolution(_solve_factor(factor, load.copy(), transposed=True), np.zeros(len(f)), FREE)
+    dual = VariationalInequality(A, f, B=-np.eye(len(f)), g=np.zeros(len(f)))
     if start is not None and start.alpha is not None and start.x is not None:
         # The multipliers of the constraints −α ≤ 0 are the slacks g − Bx.
         slack = np.maximum(program.g - program.B @ start.x, 0.0) / rows
@@ -239,10 +242,9 @@ def _least_distance(
     K, load = _whitened(program, factor, 1.0)
     depths = K @ load - program.g
     if (deepest := float((depths / row_norms(K)).max())) <= 0.0:
-        return _unpressed(program, factor, load)
-    active = np.zeros(len(K), np.int32)
-    if start is not None and start.alpha is not None:
-        active = (start.alpha > 0.0).astype(np.int32)
+        return QPSolution(_solve_factor(factor, load.copy(), transposed=True), np.zeros(len(K)), FREE)
+    begun = None if start is None else start.alpha
+    active = np.zeros(len(K), np.int32) if begun is None else (begun > 0.0).astype(np.int32)
     # DAQP takes no matrix for the identity, and 1e30 for no bound on this side.
     bounds = depths / -deepest, np.full(len(K), -1e30)
     _, _, outcome, info = daqp.solve(None, None, K, *bounds, active, **settings)
@@ -266,12 +268,6 @@ def _whitened(program: VariationalInequality, L: Array, rows: Array | float) -> 
     right[-1] = program.f
     whitened = _solve_factor(L, right.T).T
     return whitened[:-1], whitened[-1]
-
-
-def _unpressed(program: VariationalInequality, factor: Array, load: Array) -> QPSolution:
-    """The solution A⁻¹f from L⁻¹f (n,), which satisfies all constraints."""
-    x = _solve_factor(factor, load.copy(), transposed=True)
-    return QPSolution(x, np.zeros_like(program.g), "nothing to solve: no constraint acts")
 
 
 def _solve_factor(L: Array, right: Array, *, transposed: bool = False) -> Array:
@@ -316,13 +312,9 @@ def load_qpsolvers() -> tuple[Any, Mapping[str, str]]:
 
 
 def form_of(solver: str, factor: Array | None, extra: Iterable[str] | None = ()) -> str:
-    """The form in which a solver is given dense programs: "primal", "dual" or "least distance".
-
-    It is the last one for DAQP; for other solvers the dual, where the Cholesky factor of A is known.
-    """
-    if solver == "daqp" and solver not in (extra or ()):
-        return "least distance"
-    return "primal" if factor is None else "dual"
+    """The form in which a solver is given dense programs: the dual where the factor of A is known, but for DAQP."""
+    own = "primal" if factor is None else "dual"
+    return "least distance" if solver == "daqp" and solver not in (extra or ()) else own
 
 
 def takes_start(solver: str) -> bool:
