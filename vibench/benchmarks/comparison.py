@@ -66,8 +66,7 @@ def _parsed(content: bytes) -> Timed:
     libraries = own.get("libraries") or f"python {info.get('python_version', '')}"
     machine = {"machine": own.get("machine") or processor, "libraries": libraries}
     machine |= {"timer": ", ".join(timers), "code": own.get("code", "")}
-    machine = {name: unbroken(str(text)) for name, text in machine.items()}
-    return Timed(benchmarks, len(file.get("failed", ())), machine)
+    return Timed(benchmarks, len(file.get("failed", ())), {name: unbroken(str(text)) for name, text in machine.items()})
 
 
 def _measured(name: str, entry: Mapping[str, Any]) -> Measured:

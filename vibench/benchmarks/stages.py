@@ -125,9 +125,8 @@ class StageInputs:
         # `given()` makes the same reduction anew, whose models have nothing in store from earlier queries.
         dual = find(PluginKind.DUAL, spaces.dual).create({})
         strategy = None if primal is None else find(PluginKind.PRIMAL, primal.name).create({})
-        tolerance = None if primal is None else primal.tolerance
         reduction = Reduction(
-            self.problem, dual, strategy, spaces.modes, spaces.generators, tolerance,
+            self.problem, dual, strategy, spaces.modes, spaces.generators, None if primal is None else primal.tolerance,
             assembly="reduced", interpolation=self.interpolation, solver="piqp", accuracy=1e-10,
         ).given(snapshots=self.snapshots, parameters=self.training)  # fmt: skip
         # POD and cone do not depend on the enrichment: all strategies share them.
@@ -173,8 +172,7 @@ def test_pod(timing: Timing, inputs: StageInputs) -> None:
     V, u, stop = inputs.problem.V, inputs.snapshots.u, inputs.usual.modes
 
     def judge(modes: POD) -> Info:
-        left = u - modes.basis @ V.gram(modes.basis, u)
-        tail = np.linalg.norm(V.norm(left)) / np.linalg.norm(V.norm(u))
+        tail = np.linalg.norm(V.norm(u - modes.basis @ V.gram(modes.basis, u))) / np.linalg.norm(V.norm(u))
         return {"N": modes.basis.shape[1], "accuracy": {"tail": tail, "orthonormality": orthonormality(modes.basis, V)}}
 
     timing("POD", lambda: pod(u, V, stop), judge)
@@ -340,8 +338,7 @@ def errors_of(inputs: StageInputs, query: ValidationQuery, u: Array, lam: Array)
 def test_solver(timing: Timing, inputs: StageInputs, size: Size, solver: str, accuracy: float) -> None:
     """One reduced program, solved to an accuracy."""
     # The spaces of this size, as far as the snapshots give them.
-    modes = Stop(size=min(size.N, inputs.most_modes))
-    spaces = ReducedSpaces(modes, Stop(size=size.R), inputs.usual.dual)
+    spaces = ReducedSpaces(Stop(size=min(size.N, inputs.most_modes)), Stop(size=size.R), inputs.usual.dual)
     N, R = inputs.reduction(spaces).pod.basis.shape[1], inputs.reduction(spaces).cone.size
     # The snapshots of a problem give so many dimensions; larger programs would be the same.
     if inputs.sizes.setdefault((N, R), size) != size:

@@ -91,8 +91,7 @@ class AffineProblem(Problem):
         # Error bounds need the contact unknowns however many they are; solvers decide whether to condense on them.
         touched = np.unique(np.concatenate([term.indices for term in sums["B"].terms])).astype(np.intp)
         self._contact_dofs = touched if len(touched) else None
-        on_contact = sums["B"].mapped(lambda term: sp.csr_array(term[:, touched]))
-        self._contact_columns = _constant_or_sum(on_contact)
+        self._contact_columns = _constant_or_sum(sums["B"].mapped(lambda term: sp.csr_array(term[:, touched])))
 
     def _sum(self, member: Declaration) -> AffineSum:
         if isinstance(member, AffineSum):

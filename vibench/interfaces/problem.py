@@ -206,8 +206,7 @@ class Problem(ABC):
             assert contact is not None  # implied by `has_contact`
             return from_contact(contact)
 
-        fixed = np.zeros((len(self.contact_dofs), eta.shape[1]))
-        return ContactLoads(fixed, varying, 0, from_contact=from_contact)
+        return ContactLoads(np.zeros((len(self.contact_dofs), eta.shape[1])), varying, 0, from_contact=from_contact)
 
     def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
         """Function that evaluates chosen entries of the members in `entrywise`, at the cost of these entries alone.

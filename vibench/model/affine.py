@@ -82,8 +82,7 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
         if name in problem.constant:
             members[name] = AffineMember(Evaluation.CONSTANT, (getattr(first, name),))
         elif name in problem.affine:
-            terms = problem.affine[name].terms
-            members[name] = AffineMember(Evaluation.AFFINE, tuple(terms))
+            members[name] = AffineMember(Evaluation.AFFINE, problem.affine[name].terms)
         elif vanishing and name in ("B", "g"):
             members[name] = _exact(vanishing, problem.has_contact)
         else:
@@ -170,8 +169,7 @@ def decomposed(
     whether it has `Problem.contact`.
     """
     if name == "g" and (sometimes := np.any([is_absent(g) ^ is_absent(values[0]) for g in values], axis=0)).any():
-        reason = f"row {int(np.argmax(sometimes))} of g is infinite at some parameters and not at others"
-        return _exact(reason, contact)
+        return _exact(f"row {int(np.argmax(sometimes))} of g is infinite at some parameters and not at others", contact)
     entries = _Entries(values, symmetric=name == "A")
     weights = entries.weights(name, _units(V))
     spread = float(np.max(weights * np.ptp(entries.values, axis=1), initial=0.0))

@@ -227,9 +227,7 @@ def _moved_terms(
     # what is rounded in d counts as a part of its terms
     size = np.abs(moved) + unit * np.abs(step).astype(float)
     lacking, eta = pair.correction.constraints.lacking(moved, pair.correction.values, size)
-    if np.all(lacking <= 0.0):
-        return _with_round_off(pair.correction, moved, size, pair.lam, eta, terms)
-    return None
+    return _with_round_off(pair.correction, moved, size, pair.lam, eta, terms) if np.all(lacking <= 0.0) else None
 
 
 def _held(correction: Correction, p: Array) -> Array | None:
@@ -424,8 +422,7 @@ def find_correction(
     largest = 1e8 * max(np.max(lam, initial=0.0), alone)
     starts, doubtful = [chosen[kept] for chosen in (pressed, lam > 0.0) if chosen is not None], None
     for _ in range(4):
-        least = excess + margin
-        for values, forces in _minimisers(constraints, energy, lam, least, starts, largest):
+        for values, forces in _minimisers(constraints, energy, lam, excess + margin, starts, largest):
             multipliers = np.zeros(len(vi.g))
             multipliers[kept] = forces
             w, multipliers = constraints.moved(u, values, multipliers)

@@ -294,6 +294,5 @@ def residual_multiplier(vi: VariationalInequality, energy: EnergyNorm, u: Array)
     Its KKT conditions are those of the variational inequality with the load f − A u and g = 0 where it is finite:
     A w + Bᵀλ = f − A u, B w ≤ 0, λ ≥ 0 and λᵀB w = 0. Raises a `NumericalError` if none is found.
     """
-    g = np.where(is_absent(vi.g), vi.g, 0.0)
-    homogeneous = VariationalInequality(vi.A, vi.f - vi.A @ u, vi.B, g)
+    homogeneous = VariationalInequality(vi.A, vi.f - vi.A @ u, vi.B, np.where(is_absent(vi.g), vi.g, 0.0))
     return np.asarray(np.maximum(solve_unverified(homogeneous, energy.stiffness).lam, 0.0))

@@ -18,7 +18,7 @@ from vibench.interfaces.problem import MEMBERS, Contact, ContactLoads, Variation
 from vibench.interfaces.strategies import Kind
 from vibench.linalg.inner_product import RANK_RTOL
 from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
-from vibench.model.galerkin import Evaluated, ReducedModel, ReducedProblem, contact_at
+from vibench.model.galerkin import Evaluated, ReducedModel, ReducedProblem, contact_at, projections
 from vibench.reduction.supremizers import LoadCoordinates, PlainCoordinates, SpannedCoordinates, supremizers
 
 # coefficients θ of the terms at one parameter, by member
@@ -40,8 +40,7 @@ class ProjectedMember:
     @classmethod
     def from_terms(cls, terms: list[Array], member: AffineMember) -> ProjectedMember:
         """Make a member from its projected terms."""
-        shape = terms[0].shape
-        return cls(np.array([term.ravel() for term in terms]), shape, member.way is Evaluation.CONSTANT)
+        return cls(np.array([term.ravel() for term in terms]), terms[0].shape, member.way is Evaluation.CONSTANT)
 
     @classmethod
     def symmetric(cls, terms: list[Array], member: AffineMember) -> ProjectedMember:
@@ -115,32 +114,22 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Re
     if coordinates is not None and eta is not None:
         Z, chi = coordinates.vectors(np.eye(coordinates.plain.shape[0])), np.hstack([eta, chi])
     elif eta is not None:
-        B = members["B"].terms[0]
-        basis = Z = model.primal_basis(VariationalInequality(A=None, f=np.zeros(0), B=B, g=np.zeros(0)))
+        basis = Z = model.primal_basis(VariationalInequality(None, np.zeros(0), members["B"].terms[0], np.zeros(0)))
     else:
         Z = model.fixed_basis
-    A = ProjectedMember.symmetric([Z.T @ np.asarray(term @ Z) for term in members["A"].terms], members["A"])
-    contact = members["B"].way is Evaluation.CONTACT
+    of = projections(Z, chi) | {"g": lambda g: model.generators.T @ g}
+    projected = {name: [of[name](term) for term in member.terms] for name, member in members.items()}
+    A = ProjectedMember.symmetric(projected["A"], members["A"])
+    f = ProjectedMember.from_terms(projected["f"], members["f"])
+    # Without terms they are evaluated on the contact unknowns.
+    g, B = (ProjectedMember.from_terms(projected[n], members[n]) if projected[n] else None for n in ("g", "B"))
+    on_contact = np.ascontiguousarray(Z[problem.contact_dofs]) if B is None and coordinates is None else None
     count, rank = model.generators.shape[1], model.span.shape[1]
     sampled, affine = evaluated_members(members)
     # The dual program needs A⁻¹ and independent generators; then queries solve it with one factor.
     dual_is_regular = A.constant and coordinates is None and A.shape[0] >= count == rank > 0
-    return ReducedOperators(
-        sampled_entries=sampled,
-        affine=affine,
-        A=A,
-        f=ProjectedMember.from_terms([Z.T @ term for term in members["f"].terms], members["f"]),
-        g=None
-        if members["g"].way is Evaluation.CONTACT
-        else ProjectedMember.from_terms([model.generators.T @ term for term in members["g"].terms], members["g"]),
-        B=None
-        if contact
-        else ProjectedMember.from_terms([chi.T @ np.asarray(B @ Z) for B in members["B"].terms], members["B"]),
-        contact_basis=np.ascontiguousarray(Z[problem.contact_dofs]) if contact and coordinates is None else None,
-        supremizer_coordinates=coordinates,
-        basis=basis,
-        factor=scipy.linalg.cholesky(A.evaluate(None), lower=True) if dual_is_regular else None,
-    )
+    factor = scipy.linalg.cholesky(A.evaluate(None), lower=True) if dual_is_regular else None
+    return ReducedOperators(sampled, affine, A, f, g, B, on_contact, coordinates, basis, factor)
 
 
 def _supremizer_space(model: ReducedModel, B: AffineMember, eta: Array) -> PlainCoordinates:
@@ -330,19 +319,15 @@ def _enriched(members: VariationalInequality, plain: Array) -> tuple[Array, Arra
     # Unit columns: the pivots of the factorisation tell dependent supremizers, whatever their forces are.
     lengths = np.sqrt(np.einsum("ij,ij->i", B[:count], B[:count]))
     added = B[:count, N:].T[:, lengths > 0.0] / lengths[lengths > 0.0]
-    Y = np.zeros((used, N))
-    if added.size:
-        added = _pivoted_range(added)
-        Y = np.zeros((used, N + added.shape[1]))
-        Y[N:, N:] = added
-    Y[:N, :N] = np.eye(N)
+    added = _pivoted_range(added) if added.size else added[:, :0]
+    Y = np.zeros((used, N + added.shape[1]))
+    Y[:N, :N], Y[N:, N:] = np.eye(N), added
     rest = A[N:used, N:used] @ added
     projected = np.empty((Y.shape[1], Y.shape[1]))
     projected[:N, :N], projected[:N, N:], projected[N:, N:] = A[:N, :N], A[:N, N:used] @ added, added.T @ rest
     projected[N:, :N] = projected[:N, N:].T
     projected[N:, N:] = 0.5 * (projected[N:, N:] + projected[N:, N:].T)
-    enriched = np.hstack([B[count:, :N], B[count:, N:] @ added])
-    return projected, np.append(f[:N], f[N:used] @ added), enriched, Y
+    return projected, np.append(f[:N], f[N:used] @ added), np.hstack([B[count:, :N], B[count:, N:] @ added]), Y
 
 
 def _pivoted_range(y: Array) -> Array:

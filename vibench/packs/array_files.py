@@ -201,8 +201,7 @@ class ArrayFiles:
         try:
             import h5py  # noqa: PLC0415  optional
         except (Exception, SystemExit) as error:  # noqa: BLE001  a broken library raises anything
-            needs = f"HDF5 files need h5py ({in_a_line(error)})"
-            raise RequestError(f"{needs}: pip install 'vibench[hdf5]'") from None
+            raise RequestError(f"HDF5 files need h5py ({in_a_line(error)}): pip install 'vibench[hdf5]'") from None
         with h5py.File(path, "r") as file:
             node: Any = file
             for part in [part for part in inner.split("/") if part]:

@@ -96,9 +96,7 @@ class PackMember:
 
     def at(self, mu: Array) -> Any:
         """The matrix or vector at mu (d,)."""
-        if self.thetas:
-            return self.sum.at(mu)
-        return self.arrays[0 if self.listing is None else self.listing.number(mu)]
+        return self.sum.at(mu) if self.thetas else self.arrays[0 if self.listing is None else self.listing.number(mu)]
 
     def entries(self, rows: Indices, columns: Indices) -> Callable[[Array], Array]:
         """Function that evaluates these entries (k,) at mu; `columns` is not used for vectors."""

@@ -169,8 +169,7 @@ class GrowingCone:
 
     def result(self) -> Cone:
         """The cone, with its error for every number of generators."""
-        free = no_free(self.generators.shape[1])
-        return Cone(self.generators, np.array(self._errors), free, tuple(self._fallbacks))
+        return Cone(self.generators, np.array(self._errors), no_free(len(self._errors) - 1), tuple(self._fallbacks))
 
 
 def greedy_cone(snapshots: Annotated[Array, "m", "P"], W: Annotated[InnerProduct, "m"], stop: Stop) -> Cone:

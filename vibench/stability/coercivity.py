@@ -122,10 +122,8 @@ def share_of_diagonal(X: InnerProduct) -> Constant:
     """A ξ with X ≽ ξ diag(X), of the order of the largest one."""
     diagonal = X.matrix.diagonal()
     # A rough estimate is enough: it is moved by the largest margin.
-    estimate = _lowest(X.matrix, InnerProduct(sp.diags_array(diagonal)), X.riesz)(1e-2)
-    xi = estimate / (1.0 + MARGINS[-1])
-    scaled = sp.diags_array(-xi * diagonal)
-    return Constant(xi, proved_positive([X.matrix, scaled], np.sqrt(diagonal)) == X.dim)
+    xi = _lowest(X.matrix, InnerProduct(sp.diags_array(diagonal)), X.riesz)(1e-2) / (1.0 + MARGINS[-1])
+    return Constant(xi, proved_positive([X.matrix, sp.diags_array(-xi * diagonal)], np.sqrt(diagonal)) == X.dim)
 
 
 def continuity(quotients: Quotients) -> Constant:
@@ -171,14 +169,6 @@ def _lowest(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None) -> Est
         return lambda _: smallest
     iterations = Lanczos(lambda v: inverse(V.matrix @ v), A)
     return lambda accuracy: 1.0 / iterations.largest(accuracy)
-
-
-def extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
-    """Estimates of α and γ_a for A (n×n).
-
-    Raises a `NumericalError` if A is not symmetric positive definite.
-    """
-    return _lowest(A, V)(1e-3), _largest(A, V)(1e-3)
 
 
 def moved(estimate: Estimate, sign: float, proves: Callable[[float], bool]) -> Constant:

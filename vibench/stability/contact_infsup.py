@@ -133,8 +133,7 @@ class ContactInfSup:
         def stable(beta: float) -> bool:
             square = beta**2 / softness
             tau = square / theta
-            parts = [2.0 * tau * B, -(tau**2) * S, -square * W.matrix]
-            return is_proved_definite(parts, implementation(DEFAULT))
+            return is_proved_definite([2.0 * tau * B, -(tau**2) * S, -square * W.matrix], implementation(DEFAULT))
 
         constant = moved(estimate, -1.0, stable)
         return constant if constant.proved else None
@@ -157,9 +156,8 @@ class ContactInfSup:
     def _left_out(self, B: SparseMatrix, lifted: Array, residuals: Array, sizes: Array) -> float:
         """A bound of the norm of DᵀR and of the round-off in K, both in units of t (m,), the roots of diag(K)."""
         # Each entry is bounded by the mean of |x_i y_j| and its transpose, which have at most the norm |x||y|.
-        of_products = np.linalg.norm(lifted / sizes) * np.linalg.norm(
-            (residuals + _gamma(_most_entries(B) + 4) * self._forces(B)) / sizes
-        )
+        forces = residuals + _gamma(_most_entries(B) + 4) * self._forces(B)
+        of_products = np.linalg.norm(lifted / sizes) * np.linalg.norm(forces / sizes)
         return 1.01 * float(of_products + 8.0 * UNIT_ROUND_OFF * len(sizes))
 
 

@@ -132,9 +132,7 @@ def beta_span(on_span: Array) -> float:
     rows, rank = on_span.shape
     if not rank:
         return float("inf")
-    if rows < rank:
-        return 0.0
-    return float(singular_values(_with_few_rows(on_span))[-1])
+    return 0.0 if rows < rank else float(singular_values(_with_few_rows(on_span))[-1])
 
 
 def stability_ratio(beta: float, reachable: float) -> float:

@@ -173,9 +173,8 @@ def parametrize_with_checks(*plugins: Any, kind: str | None = None, **given: Any
 
     examinations = [Examination(plugin, kind, **given) for plugin in plugins]
     cases = [(one, name) for one in examinations for name in one.checks]
-    return pytest.mark.parametrize(
-        "check", [pytest.param(partial(_report, *case), id=f"{case[0].title}-{case[1]}") for case in cases]
-    )
+    parameters = [pytest.param(partial(_report, one, name), id=f"{one.title}-{name}") for one, name in cases]
+    return pytest.mark.parametrize("check", parameters)
 
 
 def _report(examination: Examination, name: str) -> None:

@@ -20,7 +20,7 @@ from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalIne
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.linalg.inner_product import InnerProduct, singular_values
 from vibench.model.affine import INTERPOLATION_RTOL, assembled_members, decomposed, held_out_error, is_missed
-from vibench.stability.coercivity import extreme_quotients
+from vibench.stability.coercivity import Quotients
 from vibench.testing.case import (
     Arrays,
     Case,
@@ -168,9 +168,8 @@ def independence(case: ProblemCase) -> Iterator[str]:
     centre = 0.5 * (box.lower + box.upper)
     for number, name in enumerate(box.names if case.points == 7 else ()):
         moved = np.where(np.arange(box.dim) == number, box.upper, centre)
-        if box.upper[number] > box.lower[number] and not any(
-            differences(case.evaluate(moved), case.evaluate(centre), case.round_off)
-        ):
+        varies = box.upper[number] > box.lower[number]
+        if varies and not any(differences(case.evaluate(moved), case.evaluate(centre), case.round_off)):
             yield Doubt(f"nothing depends on the parameter '{name}'")
 
 
@@ -426,10 +425,10 @@ def constants(case: ProblemCase) -> Iterator[str]:
     """α and γ_a of A, β_HF and γ_b of B are of a moderate ratio."""
     where, arrays = next(iter(case.results.items()))
     A, V, W = arrays["A"], case.plugin.V, case.plugin.W
-    lowest, highest = extreme_quotients(A, V)
+    of_norm, of_diagonal = Quotients(A, V), Quotients(A, InnerProduct(sp.diags_array(A.diagonal(), format="csc")))
+    lowest, highest = of_norm.lowest(1e-3), of_norm.highest(1e-3)
     yield Note(f"{where}: α = {lowest:.3g}, γ_a = {highest:.3g}")
-    low, high = extreme_quotients(A, InnerProduct(sp.diags_array(A.diagonal(), format="csc")))
-    ratio, diagonal = highest / lowest, high / low
+    ratio, diagonal = highest / lowest, of_diagonal.highest(1e-3) / of_diagonal.lowest(1e-3)
     # The ratio of a norm that bounds A from both sides does not depend on the mesh; that of diagonal matrices, of a
     # mass matrix and of any norm without gradients is O(h⁻²), and another order of the unknowns makes it larger still.
     # A good norm stays below 0.8 of the diagonal's ratio on coarse meshes; a ratio up to 10 is never doubted.
@@ -455,9 +454,8 @@ def high_fidelity_solution(case: ProblemCase) -> Iterator[str]:
     solved, contacts = list[active_set.HighFidelitySolution](), 0
     # Five evenly spread parameters; those between them only while no constraint is active.
     spread = [k for count in (5, 50) for k in np.linspace(0, len(mus) - 1, count).round().astype(int)]
-    least = min(5, case.points)
     for k in dict.fromkeys(spread):
-        if len(solved) >= least and (contacts or case.late):
+        if len(solved) >= min(5, case.points) and (contacts or case.late):
             break
         try:
             answer = solver.solve(mus[k].copy())

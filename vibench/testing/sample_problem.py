@@ -46,8 +46,7 @@ class MovingSupport(Problem):
     def assemble(self, mu: Array) -> VariationalInequality:
         """Weighted means of −u around 14 points are at most those of −ψ, where ψ is the support."""
         centres = np.linspace(0.25, 0.75, self.W.dim) + mu[0]
-        hats = np.maximum(0.0, 1.0 - np.abs(self._x[None, :] - centres[:, None]) / self._width)
-        weights = hats / self.V.dim
+        weights = np.maximum(0.0, 1.0 - np.abs(self._x - centres[:, None]) / self._width) / self.V.dim
         support = -0.2 + mu[1] - 0.8 * (self._x - 0.5 - mu[0]) ** 2
         return VariationalInequality(self._stiffness, self._load, sp.csr_array(-weights), -weights @ support)
 

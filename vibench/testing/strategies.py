@@ -234,8 +234,7 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
         except NumericalError as error:
             return str(error)
         for name, value in self.arrays(built, offline).items():
-            rows = W.dim if name == "eta" else V.dim
-            if fault := array_fault(name, value, (rows, *np.shape(value)[-1:])):
+            if fault := array_fault(name, value, (W.dim if name == "eta" else V.dim, *np.shape(value)[-1:])):
                 return fault
         return ""
 
