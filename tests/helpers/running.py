@@ -195,6 +195,13 @@ def _split(frame: pd.DataFrame, shaky: set[str]) -> tuple[pd.DataFrame, pd.DataF
     return frame[~theirs], frame[theirs]
 
 
+def succeeded(outcome: tuple[int, str, str]) -> str:
+    """What a command printed; fails unless it succeeded and had nothing to say on standard error."""
+    code, out, err = outcome
+    assert (code, err) == (0, "")
+    return out
+
+
 def refused(outcome: tuple[int, str, str], *words: str) -> str:
     """The one line of a request that was refused; fails unless it was, and holds these words."""
     code, out, err = outcome

@@ -156,7 +156,8 @@ def _problem(text: str) -> Any:
 def _study(request: str, key: str, overrides: dict[str, list[Any]], at: list[str] | None) -> Study:
     """The study of a name or file, or of one cell of it or of a results file."""
     from vibench.execution.recorded_cell import recorded_study
-    from vibench.study.matrix import expand, only_cell, read_study, study_of_cell
+    from vibench.results.selection import key_of
+    from vibench.study.matrix import expand, read_study, study_of_cell
 
     if key and Path(request).suffix == ".sqlite":
         if overrides:
@@ -168,7 +169,8 @@ def _study(request: str, key: str, overrides: dict[str, list[Any]], at: list[str
     study = read_study(request, overrides)
     if not key:
         return study
-    cell = only_cell(expand(study), key, f"'{request}'")
+    cells = {cell.key: cell for cell in expand(study)}
+    cell = cells[key_of(key, cells, request, f"vibench run {request} --dry-run")]
     # One cell is timed as often as in its study.
     rounds = {name: getattr(study, name) for name in ("timing_rounds", "timing_rounds_min")}
     return study_of_cell(cell, study.name, limits=study.limits, **rounds)

@@ -135,12 +135,12 @@ def sorted_by(frame: pd.DataFrame, keys: Sequence[str], what: str) -> pd.DataFra
     return frame.sort_values(names, ascending=rising, kind="stable", na_position="last", ignore_index=True)
 
 
-def key_of(cell: str, keys: Iterable[str], run: str) -> str:
-    """The one key of a cell of a run that begins with `cell`; a `RequestError` if there is none, or are several."""
+def key_of(cell: str, keys: Iterable[str], run: str, command: str = "vibench show RUN --table cells") -> str:
+    """The one key of a cell that begins with `cell`; a `RequestError` if there is none, or are several."""
     matching = [key for key in keys if key.startswith(cell)]
     if len(matching) != 1:
-        listed = "the column 'cell' of `vibench show RUN --table cells` lists them"
-        raise RequestError(f"{len(matching)} cells of '{run}' begin with '{cell}', expected one; {listed}")
+        said = f"{len(matching)} cells of '{run}' begin with '{cell}', expected one"
+        raise RequestError(f"{said}; `{command}` lists them")
     return matching[0]
 
 

@@ -263,11 +263,3 @@ def _stop(tolerance: str, size: str, stop: Stop | None) -> tuple[str, list[float
     if stop is None:
         return size, [1]
     return (tolerance, [stop.tolerance]) if stop.tolerance is not None else (size, [stop.size or 0])
-
-
-def only_cell(cells: Sequence[Cell], key: str, where: str) -> Cell:
-    """The cell whose key begins with `key`; raises a `RequestError` if there is none, or several."""
-    matching = [cell for cell in cells if cell.key.startswith(key)]
-    if len(matching) != 1:
-        raise RequestError(f"{len(matching)} cells of {where} begin with '{key}', expected one")
-    return matching[0]
