@@ -76,19 +76,13 @@ def _beginning(word: str, choices: Iterable[str]) -> list[str]:
         return []
 
 
-def _error_measures() -> Iterable[str]:
-    from vibench.results.ranking import columns_of_measures
-
-    return [*columns_of_measures(), "output:"]
-
-
 problems, primals, duals, formulations = (
     words(partial(_registered, CHECKED[kind])) for kind in ("problem", "primal", "dual", "formulation")
 )
 # QP solvers, installed or not.
 solvers = words(lambda: {*SETTINGS, *_registered(PluginKind.SOLVER)})
 runs = words(lambda: (path.parent.name for path in Path("runs").glob(f"*/{FILE}")))
-error_measures = words(_error_measures)
+error_measures = words(lambda: ("solution", "u", "lambda", "output:"))
 corrections = words(lambda: ("none", "feasible", "auto"))
 lists = words(lambda: (kind.plural for kind in PluginKind))
 table_names = words(lambda: ("summary", "best", "benefits", *TABLES))

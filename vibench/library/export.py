@@ -92,13 +92,17 @@ def export_model(
         raise RequestError(f"'{file}': the model is written as an npz file, whose name must end in .npz")
     if file.parent.exists() and not file.parent.is_dir():
         raise RequestError(f"'{file.parent}' is no folder")
-    # The script that is written beside exported files evaluates them without vibench.
-    script = "reduced_model.py"
-    runtime = {file.with_name(script): (files("vibench.library") / script).read_bytes()}
     sources = [file.with_suffix(".c"), file.with_suffix(".h")] if c else []
-    _refuse_to_overwrite([file, *sources], runtime)
+    for path in (file, *sources):
+        if path.exists():
+            raise RequestError(f"'{path}' exists; remove it, or choose another name")
+    # The script that is written beside exported files evaluates them without vibench.
+    script = file.with_name("reduced_model.py")
+    runtime = (files("vibench.library") / script.name).read_bytes()
+    if script.exists() and (not script.is_file() or script.read_bytes() != runtime):
+        raise RequestError(f"'{script}' exists and is not the runtime of this version; choose another folder")
     found = exported(model, tolerance, evaluations, bases, c)
-    contents = {file: _npz(found), **runtime}
+    contents = {file: _npz(found), script: runtime}
     if c:
         texts = c_source.source(found.members, found.arrays, found.about, file.stem, found.thetas, found.exact)
         contents |= {path: text.encode() for path, text in zip(sources, texts, strict=True)}
@@ -108,16 +112,6 @@ def export_model(
         for path, content in contents.items():
             write_atomically(path, content)
     return found
-
-
-def _refuse_to_overwrite(new: list[Path], scripts: Mapping[Path, bytes]) -> None:
-    """Refuse files that exist, but for scripts with the same content."""
-    for path in new:
-        if path.exists():
-            raise RequestError(f"'{path}' exists; remove it, or choose another name")
-    for script, content in scripts.items():
-        if script.exists() and (not script.is_file() or script.read_bytes() != content):
-            raise RequestError(f"'{script}' exists and is not the runtime of this version; choose another folder")
 
 
 def exported(

@@ -17,23 +17,13 @@ from vibench.text import unbroken
 
 @dataclass(frozen=True)
 class Citation:
-    """Citation of a site; raises a `RequestError` if the DOI or the date is none.
-
-    Attributes
-    ----------
-    authors
-        Names, "Family, Given" for persons; without a comma the name of a group.
-    doi, url
-        DOI of the deposit and address of the site, "" if there is none yet.
-    date
-        Date of publication, "2026-11-26" or only the year; "" if it is unknown.
-    """
+    """Citation of a site; raises a `RequestError` if the DOI or the date is none."""
 
     title: str
-    authors: tuple[str, ...] = ()
-    doi: str = ""
+    authors: tuple[str, ...] = ()  # "Family, Given" for persons; without a comma the name of a group
+    doi: str = ""  # of the deposit, "" if there is none yet
     url: str = ""
-    date: str = ""
+    date: str = ""  # of publication, "2026-11-26" or only the year; "" if it is unknown
 
     def __post_init__(self) -> None:
         # Without a resolver before it (DOI Handbook, section 2.2); braces would end a field of BibTeX.

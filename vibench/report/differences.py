@@ -131,12 +131,7 @@ class ComparedRun:
 
 
 def compared_runs(paths: Sequence[Path]) -> list[ComparedRun]:
-    """The runs of some results files, each under a name of its own: as many folders of its path as that needs."""
-    return [ComparedRun(path, name) for path, name in zip(paths, run_names(paths), strict=True)]
-
-
-def run_names(paths: Sequence[Path]) -> list[str]:
-    """Names of runs that are all different: the folder or the file, with folders before it where these are alike."""
+    """The runs of some results files, each under a name of its own: its folder or file, where needed with folders."""
     parts = [(path.resolve().parent if path.name == FILE else path.resolve().with_suffix("")).parts for path in paths]
     deepest = max(map(len, parts))
     for depth in range(1, deepest + 1):
@@ -144,7 +139,7 @@ def run_names(paths: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(set(parts)):
             break
     # One run may be named twice.
-    return numbered(names, "{} ({})")
+    return list(map(ComparedRun, paths, numbered(names, "{} ({})")))
 
 
 def numbered(names: Iterable[str], form: str) -> list[str]:

@@ -20,7 +20,8 @@ from vibench.qp.status import Status
 from vibench.report import findings, plots
 from vibench.report.differences import ComparedRun
 from vibench.report.figures import drawings, render
-from vibench.report.figures.data import label_of, problem_tables, whole
+from vibench.report.figures.data import label, problem_tables
+from vibench.report.figures.data import way as way_of_queries
 from vibench.report.plots import image_of, script_safe, short
 from vibench.results import formats, pictures, ranking, show
 from vibench.results.paired_timing import PairedTiming
@@ -30,6 +31,7 @@ from vibench.results.schema import STORED, TABLES
 from vibench.results.selection import short_keys
 from vibench.results.verdict import verdicts
 from vibench.stability.infsup import VANISHES
+from vibench.study.cells import NO_SUCH_AXIS
 from vibench.text import printable
 
 
@@ -169,7 +171,8 @@ def page(path: Path, *, figures: bool = True) -> str:
     rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
     paired = PairedTiming(read["timings"].to_dict("records"))
     certified = ranking.certified_errors(read["queries"])
-    live = [plot for name, data in data_of.items() for plot in plots.overview(name, data, rows, paired, certified)]
+    overviews = (plots.overview(name, data, rows, paired, certified) for name, data in data_of.items())
+    live = [plot for plot in overviews if plot is not None]
     images, failures = render(list(drawings(data_of.items(), ("answer",) if figures else ())), image_of)
     templates = files("vibench.report") / "templates"
     style, script = ((templates / f"report.{end}").read_text(encoding="utf-8").strip() for end in ("css", "js"))
@@ -204,10 +207,11 @@ def way(winner: Winner) -> str:
     cell = winner.cell
     if not cell["cell"]:
         return "the high-fidelity model"
-    size = f"N = {whole(cell['N'])}, R = {whole(cell['R'])}"
+    size = ", ".join(f"{name} = {formats.cell_text(cell[name]) or NO_SUCH_AXIS}" for name in ("N", "R"))
     # The offline phase involves no QP solver.
     solver = "" if winner.criterion is Criterion.OFFLINE else f"; {cell['solver']}"
-    return f"{label_of(cell)}; {cell['dual']}, {size}{solver}"
+    how = way_of_queries(cell["assembly"], cell["bounds"], cell["correction"])
+    return f"{label(cell['primal'], cell['primal_tol'], how)}; {cell['dual']}, {size}{solver}"
 
 
 def _grids(read: Mapping[str, pd.DataFrame]) -> Iterator[TableGrid]:

@@ -6,8 +6,8 @@ import base64
 import io
 import json
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -43,29 +43,47 @@ class Plot:
 
     name: str
     title: str
-    data: dict[str, Any]  # series, points with their rows in the table of cells, panels with coordinates or null
+    # Series, points with their rows in the table of cells, panels with coordinates or null, curves of costs.
+    data: dict[str, Any]
 
 
 def overview(
     name: str, data: ProblemTables, rows: Mapping[str, int], paired: PairedTiming, certified: pd.Series
-) -> Iterator[Plot]:
+) -> Plot | None:
     """Errors, and certified ones, of all models against the seconds of a query, and total costs over the queries.
 
-    The name begins with that of the problem; `rows` has the row of every cell in the table of cells.
+    The name begins with that of the problem; `rows` has the row of every cell in the table of cells. There is no plot
+    where no cell has a point in it.
     """
     cells = data.cells[ranking.eligible(data.cells) & data.cells["online_s"].notna()]
-    if cells.empty:
-        return
-    errors = ranking.errors_of_solution(cells)
-    solution, bounds = 1e3 * float(np.exp(np.log(cells["hf_s"]).mean())), cells["cell"].map(certified).astype(float)
-    relative = cells["online_s"] / cells["hf_s"]
-    shown = cells.assign(online_ms=solution * relative, error=errors, certified=bounds)
-    columns = {"error": "larger mean error of u and λ", "certified": "certified error, in energy"}
-    title = f"{data.problem}: which model, for how many queries"
-    for plot in _plot(f"{name}-overview", title, shown, columns, rows, short(solution, 4)):
-        colours = [plot.data["series"][k]["colour"] for k in plot.data["of"]]
-        costs = _costs(cells, errors, paired, rows, dict(zip(cells["cell"], colours, strict=True)))
-        yield replace(plot, data=plot.data | {"costs": costs})
+    errors, bounds = ranking.errors_of_solution(cells), cells["cell"].map(certified).astype(float)
+    # Seconds of a high-fidelity solution, which has no error: the abscissa of a line.
+    solution = 1e3 * float(np.exp(np.log(cells["hf_s"]).mean()))
+    times = solution * (cells["online_s"] / cells["hf_s"]).astype(float)
+    panels = []
+    for values, label_of_axis in ((errors, "larger mean error of u and λ"), (bounds, "certified error, in energy")):
+        # Both coordinates are missing if one of them is, or is not positive.
+        there = np.isfinite(times) & (times > 0.0) & np.isfinite(values) & (values > 0.0)
+        if there.any():
+            # Four digits are more than a screen shows.
+            ends = {end: [short(value, 4) for value in of.where(there)] for end, of in (("x", times), ("y", values))}
+            axes = {"x_label": "time of a query [ms]", "y_label": label_of_axis, "line": short(solution, 4)}
+            panels.append(axes | ends)
+    if not panels:
+        return None
+    ways = [Series(primal, way=way) for primal, way in zip(cells["primal"], cells["way"], strict=True)]
+    looks, places, duals = Looks(ways), list(dict.fromkeys(ways)), list(dict.fromkeys(cells["dual"]))
+    colours = dict(zip(cells["cell"], (looks[way].colour for way in ways), strict=True))
+    drawn = {
+        "series": [_series(way, looks[way]) for way in places],
+        "rows": [rows[cell] for cell in cells["cell"]],
+        "of": [places.index(way) for way in ways],
+        # Opacity distinguishes the dual strategies.
+        "fills": [(0.85, 0.0, 0.4)[duals.index(dual) % 3] for dual in cells["dual"]],
+        "panels": panels,
+        "costs": _costs(cells, errors, paired, rows, colours),
+    }
+    return Plot(f"{name}-overview", printable(f"{data.problem}: which model, for how many queries"), drawn)
 
 
 def _costs(
@@ -91,40 +109,6 @@ def _costs(
         ordinates = {side: [short(value, 4) for value in values] for side, values in bounds.items()}
         curves.append({"name": printable(name), "row": None if key is None else rows[key]} | drawn_as | ordinates)
     return {"x": [short(value, 4) for value in numbers], "curves": curves}
-
-
-def _plot(
-    name: str, title: str, cells: pd.DataFrame, columns: Mapping[str, str], rows: Mapping[str, int], line: Any = None
-) -> Iterator[Plot]:
-    """Columns of cells, with their labels, against the time of a query; no plot if no cell has a point in it.
-
-    The line is the abscissa of the high-fidelity model, which has no error.
-    """
-    drawn: dict[str, pd.DataFrame] = {}
-    for column in columns:
-        values = cells[["online_ms", column]].astype(float)
-        # Both values are missing if one of them is, or is not positive.
-        points = values.where(np.isfinite(values).all(axis=1) & (values > 0.0).all(axis=1))
-        if points.notna().to_numpy().any():
-            drawn[column] = points
-    if not drawn:
-        return
-    ways = [Series(name, way=way) for name, way in zip(cells["primal"], cells["way"], strict=True)]
-    looks, places, duals = Looks(ways), list(dict.fromkeys(ways)), list(dict.fromkeys(cells["dual"]))
-    data = {
-        "series": [_series(way, looks[way]) for way in places],
-        "rows": [rows[cell] for cell in cells["cell"]],
-        "of": [places.index(way) for way in ways],
-        # Opacity distinguishes the dual strategies.
-        "fills": [(0.85, 0.0, 0.4)[duals.index(dual) % 3] for dual in cells["dual"]],
-        "panels": [
-            {"x_label": "time of a query [ms]", "y_label": columns[column], "line": line}
-            # Four digits are more than a screen shows.
-            | {end: [short(value, 4) for value in points[of]] for end, of in (("x", "online_ms"), ("y", column))}
-            for column, points in drawn.items()
-        ],
-    }
-    yield Plot(name, printable(title), data)
 
 
 def _series(way: Series, look: Look) -> dict[str, Any]:

@@ -31,31 +31,15 @@ class SqlType(StrEnum):
 
 
 class Column(NamedTuple):
-    """A column of a table.
-
-    Attributes
-    ----------
-    kind
-        SQLite type of its values.
-    unit
-        Unit, explained in the documentation; "" for texts, counts and names.
-    meaning
-        Description in the documentation.
-    heading, place
-        Heading and position in the table for reading; "" and `None` if the column is not shown there.
-    constraint
-        Constraint in SQL.
-    is_json
-        Whether a text is JSON, which is never cut.
-    """
+    """A column of a table."""
 
     kind: SqlType
-    unit: str
+    unit: str  # explained in the documentation; "" for texts, counts and names
     meaning: str
-    heading: str = ""
-    place: int | None = None
-    constraint: str = ""
-    is_json: bool = False
+    heading: str = ""  # in the table for reading; "" if the column is not shown there
+    place: int | None = None  # position in that table
+    constraint: str = ""  # in SQL
+    is_json: bool = False  # such a text is never cut
 
 
 def real(unit: str, meaning: str, heading: str = "", place: int | None = None) -> Column:

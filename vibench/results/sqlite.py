@@ -177,11 +177,9 @@ def _has_index(connection: sqlite3.Connection) -> bool:
     """Whether the database can be read where it is: it needs no index of a write-ahead log, or one can be made."""
     try:
         connection.execute("PRAGMA schema_version").fetchone()
-    except sqlite3.OperationalError as error:
+    except sqlite3.DatabaseError as error:
+        # Damage is reported by what reads it.
         return code_of(error) not in (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
-    except sqlite3.DatabaseError:
-        # Damaged, which reading it reports.
-        return True
     return True
 
 

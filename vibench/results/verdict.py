@@ -22,32 +22,17 @@ from vibench.study.cells import NO_SUCH_AXIS
 class Verdict:
     """The answer for one problem; its text is two sentences.
 
-    Attributes
-    ----------
-    problem
-        Its label.
-    error
-        Largest mean relative error, of u in V and of λ in W, that the best model may have.
-    full_s
-        CPU seconds of a full solution.
-    best
-        Row of the cells table with the fastest query within the error; where none is, of the smallest error. `None`
-        where no cell takes part in a comparison.
-    within
-        Whether the errors of `best` are within `error`.
-    pays
-        Row of the thresholds table of `best` against the full model; `None` without one.
-    enriching
-        Factor by which the best fixed enrichment divides the mean error of λ at the POD and cone of `best`; `None`
-        where the run has no model without enrichment, or none with it.
+    `best` is the row of the cells table with the fastest query within the error; where none is, of the smallest error.
+    It is `None` where no cell takes part in a comparison. `enriching` is the factor by which the best fixed enrichment
+    divides the mean error of λ at its POD and cone; `None` where the run lacks a model with enrichment or without.
     """
 
     problem: str
-    error: float
-    full_s: float
+    error: float  # largest mean relative error, of u in V and of λ in W, that the best model may have
+    full_s: float  # CPU seconds of a full solution
     best: Row | None
-    within: bool
-    pays: Row | None
+    within: bool  # whether the errors of `best` are within `error`
+    pays: Row | None  # of the thresholds table, of `best` against the full model
     enriching: float | None
 
     def __str__(self) -> str:

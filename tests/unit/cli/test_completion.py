@@ -9,13 +9,14 @@ from typing import Any
 
 import pytest
 import typer
-from running import Main, Register
+from running import Main, Register, succeeded
 
 from vibench.cli import completion
 from vibench.cli.main import app
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import find, first_sentence, registered
 from vibench.qp.settings import SETTINGS
+from vibench.results.ranking import columns_of_measures
 from vibench.results.read import read_table
 from vibench.results.schema import STORED, TABLES
 from vibench.results.show import VIEWS
@@ -69,6 +70,7 @@ def test_values_are_completed_with_what_there_is_once(register: Register) -> Non
         assert completed(f"vibench {line}") == words, line
     assert set(completion.lists("")) == {kind.plural for kind in PluginKind}
     assert set(completion.table_names("")) == set(VIEWS) > set(TABLES)
+    assert set(completion.error_measures("")) == {*columns_of_measures(), "output:"}
     register(*(("vibench.problems", "mine", f"{module}:Problem") for module in ("one", "other")))
     assert completed("vibench run quick --problem ") == ["mine"]
 
@@ -128,10 +130,8 @@ def test_overviews_fit_80_columns_and_help_ends_with_examples(main: Main, monkey
     assert max(map(len, main("list")[1].splitlines())) <= 80
     lines = {line.split()[0]: line for line in main("--help")[1].splitlines() if line.startswith("  ")}
     assert [name for name in COMMANDS if lines[name].endswith("...")] == []
-    monkeypatch.setenv("COLUMNS", "80")
     for name in COMMANDS:
-        code, out, _ = main(name, "--help")
-        assert code == 0
+        out = succeeded(main(name, "--help"))
         examples = [line.strip() for line in completion.examples(name).splitlines()[2:]]
         assert examples
         assert [line.strip() for line in out.splitlines()[-len(examples) - 1 :]] == ["Examples:", *examples]

@@ -7,24 +7,21 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import query_rows
 
-from vibench.report.figures.data import on_common_queries, program_columns
+from vibench.report.figures.data import on_common_queries
 
 QUERIES = 6
 solved_by_cell = st.lists(st.sets(st.integers(0, QUERIES - 1)), min_size=1, max_size=5)
 
 
-def tables(solved: list[set[int]], zero: set[int] | None = None) -> tuple[pd.DataFrame, pd.DataFrame]:
+def tables(solved: list[set[int]], zero: set[int]) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Cells named by numbers, the k-th of which solved these queries; the error of query q is q + 1 + 10 k."""
     cells = pd.DataFrame({"cell": [str(k) for k in range(len(solved))], "queries": QUERIES, "error_u_mean": -1.0})
     rows = [
-        {name: row[name] for name in ("cell", *program_columns())}
-        | {"status": "ok" if q in mine else "inaccurate", "error_u": q + 1.0 + 10.0 * k}
-        | {"error_lambda": None if q in (zero or ()) else 2.0 * q}
-        | {"solver": f"s{k}", "accuracy": 1e-7}
+        {"cell": str(k), "query": q, "status": "ok" if q in mine else "inaccurate", "error_u": q + 1.0 + 10.0 * k}
+        | {"error_lambda": None if q in zero else 2.0 * q}
         for k, mine in enumerate(solved)
-        for q, row in enumerate(query_rows(str(k), QUERIES))
+        for q in range(QUERIES)
     ]
     return cells.assign(error_lambda_mean=-1.0), pd.DataFrame(rows).astype({"error_lambda": float})
 

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from running import DECIDED, Changed, Main, execute
+from running import DECIDED, Changed, Main, execute, succeeded
 
 from vibench.cli.result_commands import compare_runs
 from vibench.errors import RequestError
 from vibench.provenance import PROTOCOL
 from vibench.report.comparison import Comparison, compare
-from vibench.report.differences import ChangeKind, agreement, run_names
+from vibench.report.differences import ChangeKind, agreement, compared_runs
 from vibench.results.sqlite import FILE
 
 STEADY = (
@@ -224,13 +224,12 @@ def test_what_many_runs_have_is_told_in_every_table_and_format(three: list[Path]
     with pytest.raises(RequestError, match="did you mean 'online_s'"):
         found.values("online")
     # What `diff` lists of the first run and any other one is what `compare` lists of all, but for other machines.
-    everything = compare(three, 1.25).changes
+    everything = found.changes
     for path in three[1:]:
         alone = compare([three[0], path], 1.25).changes
         of_it = everything[(everything["run"] == path.stem) & (everything["against"] == "steady")]
         assert len(alone) > 0
         pd.testing.assert_frame_equal(alone, of_it.reset_index(drop=True))
-    found = compare(three, 1.25)
     seconds = found.changes[found.changes["what"] == "online_s"].set_index(["run", "against"])
     assert set(seconds.index) == {("later", "steady"), ("later", "server")}
     assert len(seconds.loc[[("later", "steady")]]) == 5
@@ -248,8 +247,7 @@ def test_what_many_runs_have_is_told_in_every_table_and_format(three: list[Path]
     assert main("compare", *pair, "--format", "csv") == (0, listed, "")
     assert main("compare", *pair)[1].endswith(main("compare", *pair, *asked)[1])
     for table, rows in (("changes", 14), ("runs", 3), ("cells", 6)):
-        code, text, _ = main("compare", *paths, "--table", table, "--format", "json")
-        assert code == 0
+        text = succeeded(main("compare", *paths, "--table", table, "--format", "json"))
         assert len(json.loads(text)) == rows
     assert main("compare", *paths, "--table", "runs", "--format", "markdown")[1].startswith("|")
     columns = json.loads(main("compare", *paths, "--table", "columns", "--format", "json")[1])
@@ -257,8 +255,7 @@ def test_what_many_runs_have_is_told_in_every_table_and_format(three: list[Path]
     (found,) = (row for row in columns if (row["what"], row["run"], row["against"]) == about)
     assert (found["cells"], found["equal"], found["worse"], found["ratio"]) == (6, 5, 1, 1.0)
     assert found["farthest_ratio"] == pytest.approx(4.0)
-    code, text, _ = main("compare", *paths, "--column", "N", "--format", "csv")
-    assert code == 0
+    text = succeeded(main("compare", *paths, "--column", "N", "--format", "csv"))
     assert text.splitlines()[0].endswith(",cell,steady,server,later")
 
 
@@ -268,8 +265,7 @@ def test_a_comparison_fits_the_terminal_and_what_it_is_about_is_shown(
     """The values of the runs, what changed to what, and which cells only one has; axes make room for them."""
     for width in (200, 80):
         monkeypatch.setenv("COLUMNS", str(width))
-        code, shown, _ = main("compare", *map(str, three))
-        assert code == 0
+        shown = succeeded(main("compare", *map(str, three)))
         tables = [line for line in shown.splitlines() if not line.startswith("not shown at")]
         assert max(map(len, tables)) <= width
         assert {"server", "later", "online_s"} <= set(shown.split())
@@ -287,9 +283,13 @@ def test_a_comparison_fits_the_terminal_and_what_it_is_about_is_shown(
 
 def test_runs_of_folders_with_the_same_name_are_told_apart(tmp_path: Path) -> None:
     paths = [tmp_path / "a" / "quick" / FILE, tmp_path / "b" / "quick" / FILE, tmp_path / "c" / "other.sqlite"]
-    assert run_names(paths) == ["a/quick", "b/quick", "c/other"]
-    assert run_names([paths[0], paths[2]]) == ["quick", "other"]
-    assert run_names([paths[0], paths[0]]) == ["quick", "quick (2)"]
+    expected = {
+        (0, 1, 2): ["a/quick", "b/quick", "c/other"],
+        (0, 2): ["quick", "other"],
+        (0, 0): ["quick", "quick (2)"],
+    }
+    for chosen, names in expected.items():
+        assert [run.name for run in compared_runs([paths[k] for k in chosen])] == names
 
 
 def threshold(meaning: str, gain: float, low: float, high: float) -> pd.DataFrame:

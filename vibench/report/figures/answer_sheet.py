@@ -42,7 +42,9 @@ def answer(data: ProblemTables) -> CaptionedFigure | None:
         lines += [_empty(panel, nothing) for panel in (stability, errors, cost)]
         return sheet.finish(" ".join([beginning, *lines]))
     rivals = _rivals(data, best)
-    names = _leading(rivals, best)
+    # The strategy of the best cell, and three with the smallest errors.
+    smallest = rivals.groupby("primal", sort=False)["error"].min().drop(best["primal"], errors="ignore").nsmallest(3)
+    names = sorted([str(best["primal"]), *map(str, smallest.index)])
     looks = Looks(map(Series, names))
     lines.append(draw_stability(stability, data, best, names, looks) or _empty(stability, "There are no constants."))
     sheet.label_ends(stability)
@@ -79,12 +81,6 @@ def _rivals(data: ProblemTables, best: Row) -> pd.DataFrame:
     # Each gain is measured in the rounds of its cell, when the machine had one speed.
     seconds = float(best["hf_s"]) * compared["online_s"].astype(float) / compared["hf_s"].astype(float)
     return compared.assign(error=errors_of_solution(compared), ms=1e3 * seconds)
-
-
-def _leading(cells: pd.DataFrame, best: Row) -> list[str]:
-    """The strategies that are drawn: that of the best cell, and three with the smallest errors; in their order."""
-    smallest = cells.groupby("primal", sort=False)["error"].min().drop(best["primal"], errors="ignore").nsmallest(3)
-    return sorted([str(best["primal"]), *map(str, smallest.index)])
 
 
 def _draw_errors(panel: Axes, cells: pd.DataFrame, names: list[str], looks: Looks, verdict: Verdict) -> None:

@@ -18,7 +18,6 @@ from vibench.qp.status import Status
 from vibench.report.figures.style import Series
 from vibench.results import pictures
 from vibench.results.read import in_order, read_table
-from vibench.results.schema import KEYS
 from vibench.study.cells import NO_SUCH_AXIS
 from vibench.text import json_object
 
@@ -156,7 +155,7 @@ def _plugin_name(cells: pd.DataFrame, axis: str) -> str:
     return ""
 
 
-def leading(panels: Sequence[Panel], most: int, noun: str = "panels") -> tuple[Sequence[Panel], str]:
+def leading(panels: Sequence[Panel], most: int, noun: str) -> tuple[Sequence[Panel], str]:
     """The panels, or curves, that a figure has room for, and a sentence on the others, "" where there are none."""
     left_out = len(panels) - most
     return panels[:most], f"The tables have the other {left_out} {noun}." if left_out > 0 else ""
@@ -174,7 +173,8 @@ def dimensions(rows: pd.DataFrame) -> str:
 def by_strategy(rows: pd.DataFrame) -> Iterator[tuple[str, Series, pd.DataFrame]]:
     """Rows by primal strategy and tolerance, with the label and the key in legends of each group."""
     for (primal, tolerance), group in rows.groupby(["primal", "primal_tol"], dropna=False):
-        yield label(primal, tolerance), series(primal, tolerance), group
+        key = Series(str(primal), "" if pd.isna(tolerance) else float(tolerance))
+        yield label(primal, tolerance), key, group
 
 
 def way(assembly: Any, bounds: Any, correction: Any) -> str:
@@ -185,24 +185,10 @@ def way(assembly: Any, bounds: Any, correction: Any) -> str:
     return ", ".join(part for part in parts if isinstance(part, str) and part)
 
 
-def series(name: Any, tolerance: Any = None, way: str = "") -> Series:
-    """Legend key: primal strategy with tolerance, assembly and correction."""
-    return Series(str(name), "" if pd.isna(tolerance) else float(tolerance), way)
-
-
 def label(name: Any, tolerance: Any = None, way: str = "") -> str:
     """Label of a primal strategy with its tolerance and the `way` of its queries."""
     with_tolerance = str(name) if pd.isna(tolerance) else f"{name}, δ = {tolerance:g}"
     return f"{with_tolerance}, {way}" if way else with_tolerance
-
-
-def whole(number: Any) -> str:
-    return NO_SUCH_AXIS if pd.isna(number) else f"{number:.0f}"
-
-
-def label_of(row: Any) -> str:
-    """The `label` of a row of the cells or the queries table."""
-    return label(row["primal"], row["primal_tol"], way(row["assembly"], row["bounds"], row["correction"]))
 
 
 def file_names(labels: list[str]) -> list[str]:
@@ -216,11 +202,6 @@ def file_names(labels: list[str]) -> list[str]:
         taken = {*plain, *names}
         names.append(name if plain.count(name) == 1 else next(one for one in numbered if one not in taken))
     return names
-
-
-def program_columns() -> list[str]:
-    """Columns that identify a quadratic program of a problem, which every solver solves at every accuracy."""
-    return [*(name for name in KEYS if name not in ("problem", "problem_options", "solver", "accuracy")), "query"]
 
 
 def on_common_queries(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:

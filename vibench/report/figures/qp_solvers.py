@@ -10,6 +10,7 @@ from vibench.qp.status import Status
 from vibench.report.figures import data as tables
 from vibench.report.figures.data import ProblemTables
 from vibench.report.figures.style import CaptionedFigure, Looks, Series, Sheet, plot, scatter
+from vibench.results.schema import KEYS
 
 
 def solvers(data: ProblemTables) -> CaptionedFigure | None:
@@ -55,7 +56,8 @@ def _accuracy(panel: Axes, queries: pd.DataFrame, names: list[str], looks: Looks
 
 def _profile(panel: Axes, queries: pd.DataFrame, looks: Looks) -> None:
     solved = queries["solve_s"].where(queries["status"] == Status.OK, np.inf).fillna(np.inf)
-    by = [*tables.program_columns(), "accuracy", "solver"]
+    # Every solver solves every program of the problem at every accuracy.
+    by = [*(name for name in KEYS if name not in ("problem", "problem_options", "solver")), "query", "solver"]
     instances = queries.assign(time=solved).groupby(by, dropna=False)["time"].min().unstack()
     # Where nobody solved a program all ratios are infinite.
     fastest = instances.min(axis=1).replace(np.inf, 1.0)
