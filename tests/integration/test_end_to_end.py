@@ -64,7 +64,6 @@ def test_enrichments_and_cones_keep_their_promise(queries: pd.DataFrame, quick_r
     assert len(own) == 2 * (125 + 81)
     bound = np.sqrt(1.0 - own.index.get_level_values("primal_tol").to_numpy() ** 2)
     assert np.all(own.to_numpy() >= bound * full.to_numpy() * (1.0 - 1e-9))
-    histories = read_table(quick_run / "results.sqlite", "histories")
     for problem in ("obstacle", "hertz"):
         sizes = cells[cells["problem"] == problem].groupby("dual")["R"].first()
         assert sizes["mcpg"] <= sizes["cpg"]

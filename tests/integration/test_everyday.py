@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.cells import cell_len
-from running import Main, Shared, refused, rows
+from running import Main, Shared, refused, rows, succeeded
 
 import vibench
 from vibench.results.schema import STORED
@@ -65,8 +65,7 @@ def home(main: Main, shared: Shared, tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert main("new", "pack", "my-model")[0] == 0
         subprocess.run([sys.executable, "my-model/write.py"], check=True, timeout=300)
         (folder / "study.toml").write_text(STUDY)
-        code, out, err = main("run", "study.toml", "--jobs", "1", "--no-figures")
-        assert (code, err) == (0, ""), out
+        succeeded(main("run", "study.toml", "--jobs", "1", "--no-figures"))
 
     copy = shutil.copytree(shared("everyday", make), tmp_path / "home")
     monkeypatch.chdir(copy)
@@ -133,8 +132,7 @@ class TestAuthor:
     def test_put_the_pack_elsewhere(self, home: Path, narrow: Main) -> None:
         elsewhere, cell = home.parent / "strings", key(home, **CERTIFIED)
         (home / "my-model").rename(elsewhere)
-        code, out, err = narrow("replay", "mine", cell, "--at", f"my-model={elsewhere}")
-        assert (code, err) == (0, "")
+        out = succeeded(narrow("replay", "mine", cell, "--at", f"my-model={elsewhere}"))
         assert "piqp" in out
         manifest = elsewhere / "pack.toml"
         manifest.write_text(manifest.read_text().replace("upper = [4.0, 0.1]", "upper = [4.0, 0.2]"))
@@ -156,8 +154,7 @@ class TestEngineer:
     @pytest.fixture
     def exported(self, home: Path, narrow: Main) -> Path:
         (home / "out").mkdir()
-        code, out, err = narrow("export", "mine", key(home, **CERTIFIED)[:8], "out/string.c")
-        assert (code, err) == (0, "")
+        out = succeeded(narrow("export", "mine", key(home, **CERTIFIED)[:8], "out/string.c"))
         assert re.search(r"query.*\bms\b", out, re.DOTALL)  # what it costs
         return home / "out"
 

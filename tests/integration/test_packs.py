@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import scipy.sparse as sp
 from packs import MANIFEST, Cable, write_cable, write_manifest
-from running import MEASURED, Main, Shared, Vibench, refused, rows
+from running import MEASURED, Main, Shared, Vibench, refused, rows, succeeded
 from samples import toml, write_study
 
 import vibench as library
@@ -82,8 +82,7 @@ def made(main: Main, shared: Shared, tmp_path: Path, monkeypatch: pytest.MonkeyP
         write_cable(folder / "packs" / "cable")
         (folder / "study.toml").write_text(toml(STUDY))
         out = ("--out", str(folder / "run"), "--jobs", "1", "--no-figures")
-        code, _, err = main("run", str(folder / "study.toml"), *out)
-        assert (code, err) == (0, "")
+        succeeded(main("run", str(folder / "study.toml"), *out))
 
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
@@ -99,8 +98,7 @@ def test_results_name_the_pack_beside_the_study_or_where_it_was_moved(made: Path
     (row,) = rows(made / "run")
     assert row["problem_options"] == '{"path": "packs/cable"}'
     assert row["status"] == "ok"
-    code, out, _ = main("run", str(made / "study.toml"), "--dry-run")  # of the copy
-    assert (code, out.split()[0]) == (0, row["cell"])
+    assert succeeded(main("run", str(made / "study.toml"), "--dry-run")).split()[0] == row["cell"]  # of the copy
     run, at = str(made / "run"), "packs/cable=../new/rope"
     (tmp_path / "new").mkdir()
     (made / "packs" / "cable").rename(tmp_path / "new" / "rope")
@@ -108,15 +106,13 @@ def test_results_name_the_pack_beside_the_study_or_where_it_was_moved(made: Path
     assert "--at packs/cable=PATH" in line
     refused(main("replay", run, key(made)[:6], "--at", "cable=x"), "no file or folder of the cell is called 'cable'")
     refused(main("replay", run, key(made)[:6], "--at", "cable"), "expected NAME=PATH")
-    code, out, err = main("replay", run, key(made)[:6], "--at", at, "--out", "program.npz")
-    assert (code, err) == (0, "")
+    out = succeeded(main("replay", run, key(made)[:6], "--at", at, "--out", "program.npz"))
     assert "piqp (recorded)" in out
     assert main("export", run, key(made), "model.npz", "--at", at)[0] == 0
     assert main("export", run, "set", "--at", at)[0] == 0
-    code, _, err = main(
-        "run", f"{run}/{FILE}", "--cell", key(made), "--at", at, "--out", "again", "--jobs", "1", "--no-figures"
+    succeeded(
+        main("run", f"{run}/{FILE}", "--cell", key(made), "--at", at, "--out", "again", "--jobs", "1", "--no-figures")
     )
-    assert (code, err) == (0, "")
     (row,) = rows(Path("again"))
     assert (row["cell"], row["status"], row["problem_options"]) == (key(made), "ok", '{"path": "packs/cable"}')
     model = library.open_run(run, at={"packs/cable": "../new/rope"}).model(key(made))
@@ -147,5 +143,4 @@ def test_two_packs_of_one_name_elsewhere_are_refused(main: Main, tmp_path: Path)
     (tmp_path / "study.toml").write_text(
         toml(STUDY | {"problem": [{"name": "pack", "options": {"path": f"{name}/cable"}} for name in ("a", "b")]})
     )
-    code, out, _ = main("run", str(tmp_path / "study.toml"), "--dry-run")
-    assert (code, out.splitlines()[-1]) == (0, "2 cells")
+    assert succeeded(main("run", str(tmp_path / "study.toml"), "--dry-run")).splitlines()[-1] == "2 cells"

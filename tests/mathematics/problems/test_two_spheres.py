@@ -149,7 +149,6 @@ def test_outputs_and_pictures_are_those_of_the_pressure_and_meshes_have_both_bod
     assert (fields.points[:, 2].min(), fields.points[:, 2].max()) == (-1.0, pytest.approx(1.2))
     moved = fields.at_points["u [m]"][fields.points[:, 2] == 1.2]
     assert moved[:, 2] == pytest.approx(-0.07)
-    one, solver = spheres(4, 0.2)
     mu = np.array([1.0, 0.08, 0.3])
     found = solver.solve(mu)
     force = next(output for output in one.outputs if output.name == "contact force")

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
-from running import Main, Register
+from running import Main, Register, succeeded
 
 from vibench import provenance
 from vibench.cli import doctor
@@ -40,8 +40,7 @@ def by_subject(findings: list[Diagnosis]) -> dict[str, Diagnosis]:
 
 
 def test_where_all_is_well_the_exit_code_is_zero(main: Main) -> None:
-    code, out, err = main("doctor")
-    assert (code, err) == (0, "")
+    out = succeeded(main("doctor"))
     lines = out.splitlines()
     assert lines[-1] == "nothing is broken"
     assert {"versions", "QP solvers", "plugins", "machine", "disk", "timings"} <= set(lines)

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
 from rich.console import Console
-from running import Main, refused
+from running import Main, refused, succeeded
 
 from vibench.cli.console import echo, new_console, print_frame
 from vibench.results import formats, show
@@ -40,8 +40,7 @@ def test_every_table_of_a_run_fits(table: str, main: Main, quick_run: Path, monk
     whole |= {part for word in whole for part in word.split(",")}
     for width in (80, 120, 200):
         monkeypatch.setenv("COLUMNS", str(width))
-        code, out, _ = main("show", str(quick_run), "--table", table, "--limit", "60")
-        assert code == 0
+        out = succeeded(main("show", str(quick_run), "--table", table, "--limit", "60"))
         assert out.startswith(f"{quick_run.name}: {table}")
         assert max(map(cell_len, out.splitlines())) <= width
         assert "…" not in out
@@ -146,9 +145,8 @@ def test_columns_and_rows_are_those_asked_for(main: Main, quick_run: Path, monke
 def test_a_cell_has_all_columns_or_is_refused(main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     row = read_table(results_file(str(quick_run)), "cells").iloc[3]
-    code, out, _ = main("show", str(quick_run), row["cell"][:6])
+    out = succeeded(main("show", str(quick_run), row["cell"][:6]))
     body, empty = out.split("\nempty: ")
-    assert code == 0
     assert out.splitlines()[0] == f"cell {row['cell']} of {quick_run.name}"
     (line,) = (line for line in body.splitlines() if line.startswith("online_s "))
     assert line.split(None, 3)[1:3] == [f"{row['online_s']:.3g}", "s"]

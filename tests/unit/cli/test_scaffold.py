@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from running import Main, Vibench, refused, rows
+from running import Main, Vibench, refused, rows, succeeded
 from samples import wire_study, write_study
 
 from vibench import HighFidelitySolver, create
@@ -89,8 +89,7 @@ def test_new_packages_register_their_plugin_and_keep_to_ruff(written: dict[str, 
 
 
 def test_the_command_says_what_to_do_next(main: Main) -> None:
-    code, out, err = main("new", "dual", "my-cone", "--out", "below/here")
-    assert (code, err) == (0, "")
+    out = succeeded(main("new", "dual", "my-cone", "--out", "below/here"))
     folder = Path("below/here/vibench-my-cone")
     assert folder.is_dir()
     assert f"pip install -e {folder}\n" in out
@@ -148,16 +147,13 @@ def test_nothing_is_left_of_a_package_that_could_not_be_written(main: Main, monk
 
 
 def test_new_studies_have_cells_and_scripts_of_new_packs_write_them(main: Main) -> None:
-    code, out, _ = main("new", "study", "my-study")
-    assert (code, out.splitlines()[1]) == (0, "  vibench run my-study.toml --dry-run")
-    code, out, _ = main("run", "my-study.toml", "--dry-run")
-    assert (code, out.splitlines()[-1]) == (0, "12 cells")
+    assert succeeded(main("new", "study", "my-study")).splitlines()[1] == "  vibench run my-study.toml --dry-run"
+    assert succeeded(main("run", "my-study.toml", "--dry-run")).splitlines()[-1] == "12 cells"
     _, out, _ = main("new", "pack", "my-model")
     script, check = (line.split()[1:] for line in out.splitlines()[1:])
     assert check == ["pack", "my-model"]
     subprocess.run([sys.executable, "-W", "error", *script], check=True, timeout=300)
-    code, out, _ = main("pack", "my-model")
-    assert (code, out.splitlines()[0]) == (0, "my-model")
+    assert succeeded(main("pack", "my-model")).splitlines()[0] == "my-model"
     pack = create("problem", "pack", {"path": "my-model"})
     assert HighFidelitySolver(pack).solve(np.array([4.0, 0.1])).lam.any()
     assert [output.name for output in pack.outputs] == ["mean deflection"]

@@ -16,7 +16,7 @@ import pytest
 import scipy.sparse as sp
 from enriching import reduced_from
 from numerics import Varying
-from running import Main, refused
+from running import Main, refused, succeeded
 from samples import with_ways
 
 import vibench
@@ -433,8 +433,7 @@ def test_the_command(run: vibench.Run, certified: bool, main: Main, tmp_path: Pa
     cell = str((certified_model(run) if certified else model_of(run, "obstacle")).row["cell"])
     file, options = tmp_path / "out" / "model.c", () if certified else ("--tolerance", "1e-4")
     asked = ("export", str(run.path.parent), cell, str(file))
-    code, out, err = main(*asked, *options)
-    assert (code, err) == (0, "")
+    out = succeeded(main(*asked, *options))
     assert f"`from reduced_model import Model`, then `Model('{file.with_suffix('.npz')}').solve(mu)" in out
     assert re.search(r"^a query takes \S+ ms; the high-fidelity solution \S+ ms$", out, re.MULTILINE)
     assert {file.name for file in (tmp_path / "out").iterdir()} == FILES | {"model.c", "model.h"}

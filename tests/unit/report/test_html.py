@@ -39,11 +39,10 @@ def test_it_needs_nothing_but_itself_and_says_what_headings_and_pictures_mean(ma
     assert all(target.startswith("#") and target[1:].split("?")[0] in links.ids for target in links.targets)
     assert "@import" not in page
     assert "url(" not in page.split("</style>")[0]
-    embedded = data(made.read_text(encoding="utf-8"), "table-data")
-    meant = {column["name"]: column["meaning"] for grid in embedded.values() for column in grid["columns"]}
+    grids = data(page, "table-data").values()
+    meant = {column["name"]: column["meaning"] for grid in grids for column in grid["columns"]}
     assert {name for name, meaning in meant.items() if not meaning} == set()
     assert meant["error λ"].startswith(f"{STORED['cells']['error_lambda_mean'].meaning} [1]")
-    page = made.read_text(encoding="utf-8")
     (caption,) = re.findall(r'href="#obstacle-answer">#</a> (.+?)</figcaption>', page)
     (alternative,) = re.findall(r'<figure id="obstacle-answer".*?<img [^>]*alt="([^"]+)"', page, re.DOTALL)
     assert len(alternative) > 40
@@ -76,9 +75,7 @@ def test_findings_tables_and_facts_are_in_it_and_first_rows_without_javascript(m
         pytest.approx(error, rel=1e-5) for error in in_order(cells)["error_lambda_mean"]
     ]
     assert "None: every query of every cell is ok." in page
-    page = made.read_text(encoding="utf-8")
     (table,) = re.findall(r'data-table="summary"></div>\n<noscript>(.*?)</noscript>', page, re.DOTALL)
-    cells = read_table(reported / FILE, "cells")
     assert table.count("<tr>") == 1 + min(len(cells), 50)
     assert "error λ</th>" in table
     assert all(f"<td>{value:.3g}</td>" in table for value in cells["error_lambda_mean"][:50])

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import typer
 from packs import write_cable
-from running import Main, Shared, execute, refused, rows
+from running import Main, Shared, execute, refused, rows, succeeded
 from samples import toml
 
 from vibench.report import identifying
@@ -37,8 +37,7 @@ def made(main: Main, shared: Shared, monkeypatch: pytest.MonkeyPatch) -> Path:
         write_cable(home.parent / "sag")
         (home / "points.csv").write_text("load,depth\n4.5,0.2\n7.5,0.3\n")
         (home / "study.toml").write_text(toml(STUDY))
-        code, _, err = main("run", str(home / "study.toml"), "--out", str(home / "run"), "--jobs", "1", "--no-figures")
-        assert (code, err) == (0, "")
+        succeeded(main("run", str(home / "study.toml"), "--out", str(home / "run"), "--jobs", "1", "--no-figures"))
         noted = (
             f"somebody''s pack ''{home}/packs/cable'' at {home}/main.py:3 or /home/somebody/secret, on a-host-of-hers"
         )
@@ -59,8 +58,7 @@ def made(main: Main, shared: Shared, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_site_names_neither_home_nor_user_nor_host(made: Path, main: Main, tmp_path: Path) -> None:
     site = tmp_path / "site"
     before = (made / FILE).read_bytes()
-    code, _, err = main("publish", "--yes", str(made), str(site), "--no-figures")
-    assert (code, err) == (0, "")
+    succeeded(main("publish", "--yes", str(made), str(site), "--no-figures"))
     files = [path for path in site.rglob("*") if path.is_file()]
     assert {path.name for path in files} >= {FILE, "report.html", "provenance.json", "cells.csv"}
     for path in files:
@@ -74,14 +72,10 @@ def test_a_site_names_neither_home_nor_user_nor_host(made: Path, main: Main, tmp
     assert row["cell"] == rows(made)[0]["cell"]
     assert row["reason"] == "…'s pack '…/cable' at …/main.py:3 or …, on …"
     assert len(read_table(published, "queries")) == 4  # its digests fit
-    at = [
-        f"{name}={made.parent / place}"
-        for name, place in (("packs/cable", "packs/cable"), ("points.csv", "points.csv"))
-    ]
-    line = refused(main("run", str(published), "--cell", row["cell"], "--dry-run"), "--at packs/cable=PATH")
-    assert "somebody" not in line
-    code, out, _ = main("run", str(published), "--cell", row["cell"], "--dry-run", "--at", at[0], "--at", at[1])
-    assert (code, out.split()[0]) == (0, row["cell"])
+    again = ("run", str(published), "--cell", row["cell"], "--dry-run")
+    assert "somebody" not in refused(main(*again), "--at packs/cable=PATH")
+    at = (word for place in ("packs/cable", "points.csv") for word in ("--at", f"{place}={made.parent / place}"))
+    assert succeeded(main(*again, *at)).split()[0] == row["cell"]
 
 
 def test_damage_is_found_and_runs_of_one_name_do_not_tell_their_folders(made: Path, main: Main, tmp_path: Path) -> None:
@@ -91,10 +85,8 @@ def test_damage_is_found_and_runs_of_one_name_do_not_tell_their_folders(made: Pa
     db.close()
     refused(main("publish", "--yes", str(tmp_path / "run"), str(tmp_path / "site")), "is damaged")
     shutil.copytree(made, tmp_path / "secret" / "run")
-    code, _, err = main(
-        "publish", "--yes", str(made), str(tmp_path / "secret" / "run"), str(tmp_path / "s"), "--no-figures"
-    )
-    assert (code, err) == (0, "")
+    runs = (str(made), str(tmp_path / "secret" / "run"))
+    succeeded(main("publish", "--yes", *runs, str(tmp_path / "s"), "--no-figures"))
     assert sorted(path.name for path in (tmp_path / "s" / "runs").iterdir()) == ["run", "run-2"]
     assert b"secret" not in (tmp_path / "s" / "index.html").read_bytes()
 

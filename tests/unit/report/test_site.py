@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from urllib.parse import unquote
@@ -13,7 +14,7 @@ import pandas as pd
 import pytest
 from browsing import observed
 from outputs import Links, clean, elements
-from running import Changed, Main, execute, refused
+from running import Changed, Main, execute, refused, succeeded
 from selenium.webdriver import Chrome
 
 from vibench.errors import RequestError
@@ -48,13 +49,18 @@ def three(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Pat
 REPORT = "<!doctype html><html><body>report</body></html>"
 
 
-@pytest.fixture(scope="module")
-def site(three: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Their site; reports have tests of their own, and take long to draw."""
-    made = tmp_path_factory.mktemp("site") / "site"
+@pytest.fixture(scope="module", autouse=True)
+def _no_reports() -> Iterator[None]:
+    """Reports have tests of their own, and take long to draw."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(html, "page", lambda *_, **__: REPORT)
-        publish(three, made, CITATION, {three[1]: "measured on a <server>"})
+        yield
+
+
+@pytest.fixture(scope="module")
+def site(three: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("site") / "site"
+    publish(three, made, CITATION, {three[1]: "measured on a <server>"})
     return made
 
 
@@ -155,14 +161,11 @@ def test_runs_have_data_commands(site: Path, three: list[Path], main: Main, monk
     assert not any("evil" in line or "passwd" in line for line in lines)
     assert any(line.startswith("# left out: 3 that") for line in lines)
     assert "osqp==1.0\n" in requirements({"osqp": "1.0"}, "")
-    own = site / "runs" / "server-1"
-    page = (own / "index.html").read_text(encoding="utf-8")
     commands = re.findall(r"<code>vibench (run results.sqlite --cell (\w+) --out again)</code>", page)
     assert [key for _, key in commands] == list(in_order(read_table(own / FILE, "cells"))["cell"])
     monkeypatch.chdir(own)
     command, key = commands[5]
-    code, out, err = main(*command.split(), "--dry-run")
-    assert (code, err) == (0, "")
+    out = succeeded(main(*command.split(), "--dry-run"))
     assert out.startswith(f"{key}  ")
 
 
@@ -234,8 +237,7 @@ def test_a_citation_is_valid_and_its_texts_are_data(site: Path) -> None:
             Citation("a", date=text)
 
 
-def test_a_label_is_no_markup(site: Path, changed: Changed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(html, "page", lambda *_, **__: REPORT)
+def test_a_label_is_no_markup(site: Path, changed: Changed, tmp_path: Path) -> None:
     label = "</script><script>alert(1)</script><img src=x onerror=alert(1)>' onclick='x"
     quoted = label.replace("'", "''") + "' || char(27) || '"
     axes = ("problem", "dual", "primal", "solver", "machine", "code", "study_hash")
@@ -249,20 +251,10 @@ def test_a_label_is_no_markup(site: Path, changed: Changed, tmp_path: Path, monk
         assert clean(text)
 
 
-@pytest.fixture(scope="module")
-def of_one(three: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A site of one run whose report is empty."""
-    made = tmp_path_factory.mktemp("one") / "small"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(html, "page", lambda *_, **__: REPORT)
-        publish(three[:1], made, CITATION)
-    return made
-
-
 @pytest.fixture
-def small(of_one: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(html, "page", lambda *_, **__: REPORT)
-    return shutil.copytree(of_one, tmp_path / "small")
+def small(three: list[Path], tmp_path: Path) -> Path:
+    """A site of one run."""
+    return publish(three[:1], tmp_path / "small", CITATION).parent
 
 
 def test_a_site_is_replaced_and_files_of_others_stay(small: Path, three: list[Path]) -> None:
@@ -300,7 +292,7 @@ def test_links_and_lists_that_cannot_be_trusted_are_refused(small: Path, three: 
             publish(three[:1], small, CITATION)
 
 
-def test_a_command_writes_sites(three: list[Path], main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_command_writes_sites(three: list[Path], main: Main, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("all of it")
     refused(main("publish", "--yes", str(three[0]), str(tmp_path / "mine")), "mine", "not written by `vibench publish`")
@@ -309,10 +301,8 @@ def test_a_command_writes_sites(three: list[Path], main: Main, tmp_path: Path, m
     refused(main("publish", "--yes", "nowhere", str(tmp_path / "new")), "no results in 'nowhere'")
     refused(main("publish", "--yes", str(three[0]), str(tmp_path / "new"), "--doi", "abc"), "no DOI")
     assert not (tmp_path / "new").exists()
-    monkeypatch.setattr(html, "page", lambda *_, **__: REPORT)
     arguments = ("--title", "Ours", "--author", "Doe, Jane", "--url", "https://example.org/", "--date", "2026-11-26")
-    code, out, err = main("publish", "--yes", *map(str, three[:2]), str(tmp_path / "new" / "site"), *arguments)
-    assert (code, err) == (0, "")
+    out = succeeded(main("publish", "--yes", *map(str, three[:2]), str(tmp_path / "new" / "site"), *arguments))
     assert out == f"site of 2 runs: {tmp_path / 'new' / 'site' / 'index.html'}\n"
     known = of_yaml((tmp_path / "new" / "site" / "CITATION.cff").read_text())
     assert (known["url"], known["date-released"]) == ("https://example.org/", "2026-11-26")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from running import Main, refused
+from running import Main, refused, succeeded
 from samples import cell_row
 
 import vibench
@@ -109,8 +109,7 @@ def test_only_models_that_are_accurate_enough_are_compared(path: Path, main: Mai
         found = vibench.open_run(path).break_even(measure, within=largest)
         assert set(pairs_of(found)) == pairs
         chosen = ("--error", measure, "--within", str(largest), "--format", "csv", "--columns", "primal_a,primal_b")
-        code, out, err = main("show", str(path.parent), "--table", "benefits", *chosen)
-        assert (code, err) == (0, "")
+        out = succeeded(main("show", str(path.parent), "--table", "benefits", *chosen))
         shown = {(a or "high-fidelity", b) for a, b in pairs}
         assert {tuple(line.split(",")) for line in out.splitlines()[1:]} == shown
 
@@ -130,9 +129,8 @@ def test_the_table_and_the_fastest_cells_are_those_of_the_measure(path: Path, ma
     assert list(zip(found["cell"], found["error_below"], strict=True)) == [("c", 1e-3)]
     found = fastest(cells, errors_of(cells, outputs, "output:area"))
     assert list(zip(found["cell"], found["error_below"], strict=True)) == [("b", 0.1)]  # 20 % are no answer
-    code, out, _ = main("show", str(path.parent), "--table", "best", "--error", "output:area", "--columns", "cell",
-                        "--format", "csv")  # fmt: skip
-    assert (code, out) == (0, "cell\nb\n")
+    asked = ("show", str(path.parent), "--table", "best", "--error", "output:area", "--columns", "cell")
+    assert succeeded(main(*asked, "--format", "csv")) == "cell\nb\n"
 
 
 def test_no_measure_is_refused_and_a_pair_without_an_error_has_none(path: Path, main: Main) -> None:

@@ -14,6 +14,7 @@ from scipy.special import stdtrit
 from vibench.results import paired_timing
 from vibench.results.break_even import TAIL, compared
 from vibench.results.paired_timing import CONDITIONS, MeanEstimate, PairedTiming
+from vibench.results.schema import STORED
 
 GROUPS, CELLS, ROUNDS, SECONDS = 3, 6, 3, 0.08
 """Groups, cells of each, rounds of a block, and seconds of a cell's part of a round."""
@@ -114,10 +115,6 @@ def test_intervals_of_cells_whose_rounds_end_when_they_are_decided_contain_the_t
 def runs_of_break_even(kind: str, offline_noise: float, rng: np.random.Generator) -> Iterator[bool]:
     """Whether the intervals of break-even numbers contain the true ones, in a run whose offline noise is known."""
     rows, truth = measured(kind, 4, GROUPS, rng)
-    keys = ("problem", "problem_options", "training", "training_options", "formulation",
-            "formulation_options", "dual", "dual_options", "pod_tol", "pod_size",
-            "dual_tol", "dual_size", "solver", "accuracy", "correction", "primal_options", "validation",
-            "validation_options", "machine")  # fmt: skip
     cells, numbers = [], {}
     for cell, true in truth.items():
         level = min(true, -0.3)
@@ -128,7 +125,7 @@ def runs_of_break_even(kind: str, offline_noise: float, rng: np.random.Generator
         offline = 100.0 * np.exp(offline_noise * rng.standard_normal())
         factor = np.exp(1.96 * offline_noise)
         cells.append(
-            dict.fromkeys(keys) | {"cell": cell, "primal": "p", "primal_tol": None, "assembly": "full", "bounds": 0}
+            dict.fromkeys(STORED["cells"]) | {"cell": cell, "primal": "p", "assembly": "full", "bounds": 0}
             | {"offline_s": offline, "offline_low_s": offline / factor, "offline_high_s": offline * factor}
             | {"hf_setup_s": 0.0, "hf_s": 1.0, "online_s": 1.0, "enrichment_kind": "fixed"}
         )  # fmt: skip
