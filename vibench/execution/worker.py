@@ -11,21 +11,20 @@ import socket
 import sys
 import threading
 import time
-import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from vibench import interrupts
 from vibench.errors import NumericalError, StorageError, UnsupportedError, VibenchError, in_a_line, message_of
 from vibench.execution import supervisor
 from vibench.execution.supervisor import Batch, Job, Progress
+from vibench.process import put_back
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Items, ItemwiseStage, Unstored
@@ -34,30 +33,6 @@ from vibench.stages.snapshots import unchanged
 T = TypeVar("T")
 Send = Callable[[Any], None]
 Enter = Callable[[int, bool], None]  # sets the current item, and whether its operation has a time limit of its own
-
-
-def _folder() -> str:
-    try:
-        return str(Path.cwd())
-    except OSError:
-        return os.sep  # it has been removed
-
-
-def _set_environment(known: Mapping[str, str]) -> None:
-    os.environ.clear()
-    os.environ.update(known)
-
-
-def _state() -> dict[str, tuple[Any, Callable[[Any], object]]]:
-    """The state of this process that plugins may change, as it is now, and how every part is put back."""
-    return {
-        "sys.path": (sys.path[:], lambda known: setattr(sys, "path", known)),
-        "the recursion limit": (sys.getrecursionlimit(), sys.setrecursionlimit),
-        "numpy.seterr": (np.geterr(), lambda known: np.seterr(**known)),
-        "warnings.filters": (warnings.filters[:], lambda known: setattr(warnings, "filters", known)),
-        "the working directory": (_folder(), os.chdir),
-        "the environment": (os.environ.copy(), _set_environment),
-    }
 
 
 class _NoMemoryError(Exception):
@@ -202,11 +177,9 @@ def _guarded(job: Job, work: Callable[[], T]) -> T | Failed:
     """The outcome of some work; what plugins of other packages have changed in this process is put back after it."""
     if not job.stage.packages:
         return _outcome(job.memory_gib, work)
-    before, threads = _state(), set(threading.enumerate())
-    outcome = _outcome(job.memory_gib, work)
-    changed = [name for name, (value, _) in _state().items() if value != before[name][0]]
-    for value, put_back in map(before.__getitem__, changed):
-        put_back(value)
+    threads = set(threading.enumerate())
+    with put_back() as changed:
+        outcome = _outcome(job.memory_gib, work)
     # Threads cannot be put back.
     if isinstance(outcome, Failed) or not threads.issuperset(threading.enumerate()):
         _failed.append(job.stage.key)

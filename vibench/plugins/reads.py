@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from vibench.files import file_digest
+from vibench.process import put_back
 
 # Files read and files written by each work that this process has watched, the current one last.
 _watched: list[tuple[set[str], set[str]]] = []
@@ -30,7 +31,7 @@ def reads_of(work: Callable[[], Any]) -> dict[str, str]:
         os.environ.__class__ = _Environment
     _watched.append((set(), set()))
     # The stage that does the same says what a plugin raises.
-    with contextlib.suppress(Exception, SystemExit):
+    with contextlib.suppress(Exception, SystemExit), put_back():
         work()
     read, written = _watched[-1]
     files = {name: file for name, one in sys.modules.items() if (file := getattr(one, "__file__", None))}

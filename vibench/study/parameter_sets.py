@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Literal, cast
@@ -9,11 +11,12 @@ from typing import Literal, cast
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.errors import NumericalError, RequestError, placed
+from vibench.errors import NumericalError, RequestError, in_a_line
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import AdaptiveSampling, Sampling
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.plugins.plugin import Plugin
+from vibench.process import put_back
 
 # Name of the training and the validation set of the problem itself.
 OWN = "own"
@@ -85,19 +88,28 @@ def is_available(*plugins: Plugin) -> bool:
 
 @lru_cache(maxsize=4)
 def _problem(plugin: Plugin) -> Problem:
-    with placed(f"problem '{plugin.name}'", NumericalError):
+    with _refused(f"problem '{plugin.name}'"):
         return cast("Problem", plugin.create())
+
+
+@contextmanager
+def _refused(who: str) -> Iterator[None]:
+    """Turn what a plugin raises in the process of the command into a `RequestError`, and put back what it changes."""
+    try:
+        with put_back():
+            yield
+    except (Exception, SystemExit) as error:  # noqa: BLE001  plugins raise anything
+        told = isinstance(error, RequestError | NumericalError)
+        raise RequestError(f"{who}: {error if told else in_a_line(error)}") from None
 
 
 @lru_cache(maxsize=64)
 def parameters_of(problem: Plugin, parameters: ParameterSet) -> Array:
     """The parameters (P×d) of a set for a problem, which is built; cached, so that nobody may change them."""
     built, sampling = _problem(problem), parameters.sampling
-    try:
+    strategy = "" if sampling is None else f"sampling strategy '{sampling.name}' for "
+    with _refused(f"{strategy}problem '{problem.name}'"):
         return parameters.of(built)
-    except (RequestError, NumericalError) as error:
-        strategy = "" if sampling is None else f"sampling strategy '{sampling.name}' for "
-        raise RequestError(f"{strategy}problem '{problem.name}': {error}") from None
 
 
 def check_sets(problem: Plugin, training: ParameterSet, validation: ParameterSet) -> None:
