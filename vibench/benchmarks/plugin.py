@@ -9,7 +9,6 @@ timed once, then once more, and the rounds are put together. A plugin that ends 
 from __future__ import annotations
 
 import contextlib
-import faulthandler
 import inspect
 import math
 import os
@@ -32,7 +31,7 @@ from _pytest.runner import runtestprotocol
 from pytest_benchmark.stats import Metadata, Stats
 from threadpoolctl import threadpool_limits
 
-from vibench import benchmarks, provenance
+from vibench import benchmarks, guardian, provenance
 from vibench.benchmarks import Timing
 from vibench.benchmarks.stages import StageInputs
 from vibench.errors import VibenchError, in_a_line, message_of
@@ -180,7 +179,8 @@ class Passes:
         """Run the items from one on in a process until it ends; returns the next one."""
         items = self._items
         ours, theirs = Pipe(duplex=False)
-        process, reason, status = os.fork(), "", 0
+        # Ctrl-C on the terminal ends this process, with which the other one ends.
+        process, reason, status = guardian.fork(), "", 0
         if not process:
             # With its own copy of this end open, a send would wait for ever if the other process has died.
             ours.close()
@@ -220,7 +220,6 @@ class Passes:
     def _work(self, begun: int, connection: Connection) -> None:
         """Run items and send their reports; this process then ends."""
         items, own, memory = self._items, os.getpid(), int(Limits().memory_gib * 2**30)
-        os.setpgid(0, 0)  # Ctrl-C on the terminal ends the other process, which ends this one
         resource.setrlimit(resource.RLIMIT_AS, (memory, resource.getrlimit(resource.RLIMIT_AS)[1]))
         serialised = self._config.hook.pytest_report_to_serializable
         try:
@@ -229,8 +228,6 @@ class Passes:
                     if _name(items[number].nodeid) in self._ended:
                         continue
                     connection.send(number)
-                    # If the other process has died, nobody else enforces the limit.
-                    faulthandler.dump_traceback_later(2.0 * self._setting.seconds + 60.0, exit=True)
                     following = items[number + 1] if number + 1 < len(items) else None
                     for report in runtestprotocol(items[number], log=False, nextitem=following):
                         # A plugin forked: the copy must not speak for this process.
