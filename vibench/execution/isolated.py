@@ -13,7 +13,10 @@ from typing import Any
 
 from vibench.errors import in_a_line
 from vibench.execution.supervisor import Job, Supervisor
+from vibench.interfaces.formulations import Formulation
 from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.strategies import DualStrategy, PrimalStrategy, Sampling, Stop
+from vibench.offline.sample_problem import sample_offline, sample_reduction, sample_snapshots
 from vibench.plugins import registry
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.options import options_as_json
@@ -150,7 +153,9 @@ def watch_first_use(
     if changed:
         more = f" and {len(changed) - 1} more" * (len(changed) > 1)
         note(f"the {plugin} reads {changed[0]}{more}, changed since: what it computes is computed again")
-    there = call_isolated(reads_of, partial(_first_use, plugin), seconds=seconds, supervisor=supervisor)
+    own: Any = {"supervisor": supervisor, "owners": (plugin.registered.package,)}
+    # A strategy and a formulation are tried on the sample problem, which takes seconds.
+    there = call_isolated(reads_of, partial(_first_use, plugin), seconds=min(seconds, 60.0), **own)
     if not isinstance(there, Mapping):
         return None
     # A process of ours has some variables of its own.
@@ -161,5 +166,17 @@ def _first_use(plugin: Plugin) -> None:
     # Another plugin may be the same class with other options.
     vars(plugin.registered).pop("given", None)
     made = plugin.create()
-    if isinstance(made, Problem):
-        made.assemble(made.training_set()[0])
+    match made:
+        case Problem():
+            mu = made.training_set()[0]
+            made.assemble(mu)
+            made.contact(mu)
+        case Sampling():
+            made.parameters(sample_offline().problem.parameters)
+        case DualStrategy():
+            made.reduce(*sample_snapshots(), Stop(size=2))
+        case PrimalStrategy():
+            made.build(sample_offline(), 0.5 if made.takes_tolerance else None)
+        case Formulation():
+            sample = sample_reduction()
+            sample.with_formulation(made).model.solve(sample.parameters[0])

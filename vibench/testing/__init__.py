@@ -11,6 +11,7 @@ are compared; a QP solver is the function itself. `check` makes all checks at on
 that lists every failure; `examine`, like the command `vibench check`, returns the results.
 """
 
+from vibench.offline.sample_problem import MovingSupport, sample_offline, sample_reduction, sample_snapshots
 from vibench.testing.checks import (
     SECONDS,
     CheckResult,
@@ -22,7 +23,6 @@ from vibench.testing.checks import (
     examine,
     parametrize_with_checks,
 )
-from vibench.testing.sample_problem import MovingSupport, sample_offline, sample_reduction, sample_snapshots
 
 __all__ = [
     "SECONDS", "CheckResult", "ConformanceError", "ConformanceWarning", "Examination", "MovingSupport", "Verdict",

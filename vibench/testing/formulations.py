@@ -19,11 +19,11 @@ from vibench.model.errors import residual_multiplier
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import ACCURACY, CellSolver, Model, check_built
 from vibench.offline.reduction import Reduction
+from vibench.offline.sample_problem import sample_reduction
 from vibench.qp.status import Status
 from vibench.stages.artefacts import dumps, loads
 from vibench.testing.case import Arrays, Case, at, difference, differences, largest_entry
 from vibench.testing.checks import Check, Note
-from vibench.testing.sample_problem import sample_reduction
 
 
 class Answered(NamedTuple):

@@ -8,6 +8,7 @@ from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
+from operator import attrgetter
 
 import numpy as np
 
@@ -30,13 +31,13 @@ from vibench.interfaces.strategies import (
 )
 from vibench.interfaces.validation import check_cone, check_enrichment
 from vibench.linalg.inner_product import InnerProduct
+from vibench.offline.sample_problem import sample_offline, sample_snapshots
 from vibench.reduction.cones import project_on_cone
 from vibench.reduction.nested import NestedStrategy, grow_through
 from vibench.stages.artefacts import dumps, loads
 from vibench.stages.enrichment import BuiltEnrichment
 from vibench.testing.case import Arrays, Case, array_fault, at, difference, unmutated
 from vibench.testing.checks import Check, ConformanceError, Doubt, Note, raised
-from vibench.testing.sample_problem import arrays_of, copy_of, sample_offline, sample_snapshots
 
 
 @dataclass(eq=False)
@@ -186,7 +187,7 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
         return {f"tolerance {tolerance}": tolerance for tolerance in ordered}
 
     def evaluate(self, argument: float | None, plugin: PrimalStrategy | None = None) -> Enrichment:
-        given = copy_of(self.model)
+        given = _copy_of(self.model)
         return self.clocked("an enrichment", lambda: (plugin or self.plugin).build(given, argument))
 
     def arrays(self, result: Enrichment, offline: Offline | None = None) -> Arrays:
@@ -257,7 +258,7 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
             return
         # A run grows an enrichment once, through all tolerances of a study.
         tolerances = {name: tolerance for name, tolerance in self.arguments.items() if tolerance is not None}
-        grown = grow_through(self.plugin, copy_of(self.model), tolerances.values())
+        grown = grow_through(self.plugin, _copy_of(self.model), tolerances.values())
         fixed = self._fixed()
         tightest, longest = list(fixed.items())[-1]
         # The growth may be orthonormalised in another order: the difference is round-off.
@@ -275,13 +276,13 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
     def no_mutation(self) -> None:
         """`build` changes nothing of the reduced model."""
         for name, tolerance in self.arguments.items():
-            given = copy_of(self.model)
-            unmutated(f"{name}: build", arrays_of(given), partial(self.plugin.build, given, tolerance))
+            given = _copy_of(self.model)
+            unmutated(f"{name}: build", _arrays_of(given), partial(self.plugin.build, given, tolerance))
 
     def without_contact(self) -> Iterator[str]:
         """A cone without generators, as of snapshots without contact, is accepted or refused."""
         none = np.zeros((self.model.problem.W.dim, 0))
-        offline = replace(copy_of(self.model), cone=Cone(none, np.zeros(1), no_free(0)), span=none)
+        offline = replace(_copy_of(self.model), cone=Cone(none, np.zeros(1), no_free(0)), span=none)
         try:
             built = self.plugin.build(offline, next(iter(self.arguments.values())))
         except VibenchError:  # a strategy may refuse it in one line
@@ -451,3 +452,13 @@ def _train(plugin: Sampling, box: ParameterBox) -> list[Array]:
     except Exception as error:
         raise ConformanceError(f"train fails after {len(trainer.solved)} solutions: {raised(error)}") from error
     return trainer.solved
+
+
+def _copy_of(offline: Offline) -> Offline:
+    """A copy with arrays of its own; the problem is shared."""
+    return deepcopy(offline, {id(offline.problem): offline.problem})
+
+
+def _arrays_of(offline: Offline) -> Arrays:
+    names = ("basis", "span", "training", "cone.generators", "cone.errors", "problem.V.matrix", "problem.W.matrix")
+    return {f"offline.{name}": attrgetter(name)(offline) for name in names}

@@ -5,6 +5,7 @@ import json
 import linecache
 import os
 import pickle
+import re
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -273,15 +274,27 @@ WHOLE = """
             except FileNotFoundError:
                 return super().assemble(mu)
 """
-FILES = ["reads_whole.py", "table.txt", "text.json", "reads_evaluated.py", "reads_statement.py"]
-FILES += [
-    "reads_package/inner.py",
-    "reads_package/__init__.py",
-    "reads_by_name.py",
-    "reads_second.py",
-    "script.py",
-    "later.txt",
-]
+FILES = [
+    "reads_whole.py", "table.txt", "text.json", "reads_evaluated.py", "reads_statement.py", "reads_package/inner.py",
+    "reads_package/__init__.py", "reads_by_name.py", "reads_second.py", "script.py", "later.txt",
+]  # fmt: skip
+LATE = """
+    import numpy, vibench
+    class Dual(vibench.DualStrategy):
+        def reduce(self, *_): import late_dual
+    class Primal(vibench.PrimalStrategy):
+        def build(self, *_): import late_primal
+    class Sampling(vibench.Sampling):
+        def parameters(self, *_): import late_sampling
+    class Model(vibench.FormulationModel):
+        dimension = 1
+        def solve(self, *_): import late_solve; return vibench.FormulationAnswer(numpy.ones(1))
+        def reconstruct(self, *_): import late_reconstruct
+    class Formulation(vibench.Formulation):
+        uses = ()
+        def build(self, *_): import late_build; return {}
+        def model(self, *_): import late_model; return Model()
+"""
 
 
 def test_what_is_read_in_the_first_use_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -316,3 +329,17 @@ def test_what_is_read_in_the_first_use_counts(tmp_path: Path, monkeypatch: pytes
     read.clear()
     assert recall_reads([plugin], store, lambda _, changed: told.extend(changed) or again)
     assert (told, plugin.as_installed() != before) == ([f"${names[0]}"], True)
+
+
+def test_what_strategies_and_formulations_import_late_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "late_whole.py").write_text(dedent(LATE))
+    files, read = [tmp_path / f"{name}.py" for name in re.findall(r"late_\w+", LATE)], set[str]()
+    for file in files:
+        file.touch()
+    with closing(Supervisor()) as supervisor:
+        for kind, name in (("DUAL", "Dual"), ("PRIMAL", "Primal"), ("SAMPLING", "Sampling"), ("FORMULATION",) * 2):
+            given = getattr(importlib.import_module("late_whole"), name.title())
+            plugin = Plugin.of(give(PluginKind[kind], name, given), {})
+            read |= {*(watch_first_use(plugin, [], note=print, supervisor=supervisor, seconds=60.0) or ())}
+    assert {*map(str, files)} <= read

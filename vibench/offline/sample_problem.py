@@ -1,10 +1,8 @@
-"""The sample problem on which strategies are checked, its snapshots, and a reduced model of it."""
+"""The sample problem on which strategies and formulations are tried, its snapshots, and a reduced model of it."""
 
 from __future__ import annotations
 
-from copy import deepcopy
 from functools import cache
-from operator import attrgetter
 from typing import ClassVar
 
 import numpy as np
@@ -19,7 +17,6 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.offline.reduction import Reduction, high_fidelity_sweep
 from vibench.reduction.cones import greedy_cone
 from vibench.reduction.supremizers import supremizers
-from vibench.testing.case import Arrays
 
 
 class MovingSupport(Problem):
@@ -97,13 +94,3 @@ def sample_reduction() -> Reduction:
     """An offline phase of the sample problem with all its steps, for formulations: V_N of 1e-3, a cone of 1e-2."""
     stops = Stop(tolerance=1e-3), Stop(tolerance=1e-2)
     return Reduction(MovingSupport(), _Greedy(), _Supremizers(), *stops).given(snapshots=_snapshots())
-
-
-def copy_of(offline: Offline) -> Offline:
-    """A copy with arrays of its own; the problem is shared."""
-    return deepcopy(offline, {id(offline.problem): offline.problem})
-
-
-def arrays_of(offline: Offline) -> Arrays:
-    names = ("basis", "span", "training", "cone.generators", "cone.errors", "problem.V.matrix", "problem.W.matrix")
-    return {f"offline.{name}": attrgetter(name)(offline) for name in names}
