@@ -182,8 +182,8 @@ class SolveQP(Protocol):
         """The solution x (n,), α (m,) ≥ 0 of min ½xᵀA x − fᵀx, B x ≤ g, dense; either is `None` if it has found none.
 
         `factor` is the Cholesky factor (lower) of A where it is known, `start` a solution to start from where the
-        solver can. The solution of the last program of a query is verified outside its seconds: the row of the query
-        is not ok if its natural residuals exceed the accuracy.
+        solver can. The solution of the last program of a query is verified outside its seconds. The row of the query
+        is not ok if its natural residuals exceed the accuracy, or if `x` and `alpha` of the answer are others.
         """
 
 

@@ -73,11 +73,18 @@ class CellSolver:
         self.last = program, solution
         return solution
 
-    def verdict(self, slackened: float) -> tuple[Status, str, Residuals | None]:
-        """The verdict of verification on the last solution, to some multiple of the accuracy; ok if there is none."""
+    def verdict(self, answer: FormulationAnswer, slackened: float) -> tuple[Status, str, Residuals | None]:
+        """The verdict of verification on an answer, to some multiple of the accuracy; ok if no program was solved."""
         if self.last is None:
             return Status.OK, "", None
-        return verify(*self.last, slackened * self._accuracy)
+        status, reason, residuals = verify(*self.last, slackened * self._accuracy)
+        of_last = (answer.x, self.last[1].x), (answer.alpha, self.last[1].alpha)
+        # Any program may be solved last: what is verified has to be what is answered.
+        if status is Status.OK and any(
+            one is not None and (known is None or not np.array_equal(one, known)) for one, known in of_last
+        ):
+            return Status.INACCURATE, "its solution is not the answer, which nothing verifies", None
+        return status, reason, residuals
 
 
 class QueryStatus(NamedTuple):
@@ -214,7 +221,7 @@ class Model:
         if answer.x is None:
             return QueryStatus(Status.FAILED if status is Status.OK else status, reason or "there is no answer")
         # A formulation may take a failed program for solved: its own outcome never improves on the verification.
-        of_qp, why, residuals = solver.verdict(slackened)
+        of_qp, why, residuals = solver.verdict(answer, slackened)
         if of_qp.severity > status.severity:
             status, reason = of_qp, f"its last quadratic program: {why}"
         if not (is_sound(answer.x) and is_sound(answer.alpha)):
