@@ -48,10 +48,11 @@ class Judged:
     """In an `Annotated` type: the function judges values by itself."""
 
 
-def bordered(called: F, owner: type | None = None) -> F:
+def bordered(called: F, owner: type | None = None, declared: Callable[..., Any] | None = None) -> F:
     """Check the arguments of a function, or of the constructor and the public methods of a class.
 
     A `RequestError` names the argument, what it is and what is right, and the nearest right name of an unknown one.
+    The annotations are those of the function itself, or of the one that has `declared` it.
     """
     if isinstance(called, type):
         for name, member in list(vars(called).items()):
@@ -59,7 +60,7 @@ def bordered(called: F, owner: type | None = None) -> F:
                 setattr(called, name, bordered(member, called if name[0] != "_" else None))
         return called
     # Annotations may name what is defined below the function.
-    signature = functools.cache(lambda: _Signature(called, owner))
+    signature = functools.cache(lambda: _Signature(called, owner, declared or called))
 
     @functools.wraps(called)
     def call(*given: Any, **named: Any) -> Any:
@@ -67,6 +68,20 @@ def bordered(called: F, owner: type | None = None) -> F:
         return called(*given, **named)
 
     return cast(F, call)
+
+
+def overridden(kind: type, module: str) -> None:
+    """Check the arguments of methods of a class by the annotations of those in a module that they override."""
+    bases = [vars(base) for base in kind.__mro__[1:] if base.__module__ == module]
+    for name, member in list(vars(kind).items()) if kind.__module__ != module else ():
+        declared = next((base[name] for base in bases if name in base and name[0] != "_"), None)
+        if isinstance(member, types.FunctionType) and isinstance(declared, types.FunctionType):
+            setattr(kind, name, bordered(member, declared=declared))
+
+
+def inside(method: F) -> F:
+    """A method of an object without the checks of `overridden`, for calls by vibench, which are timed."""
+    return cast(F, types.MethodType(inspect.unwrap(method.__func__), method.__self__))  # type: ignore[attr-defined]
 
 
 def constructed(kind: type[T]) -> type[T]:
@@ -86,12 +101,12 @@ def public(function: Callable[..., Any], module: str) -> Callable[..., Any]:
 class _Signature:
     """The rules of the arguments of a function, compiled from its annotations."""
 
-    def __init__(self, function: Callable[..., Any], owner: type | None) -> None:
+    def __init__(self, function: Callable[..., Any], owner: type | None, declared: Callable[..., Any]) -> None:
         self._signature, self._title = inspect.signature(function), function.__qualname__.removesuffix(".__init__")
         # Annotations of results may be names for the type checker alone.
-        hinted = {name: hint for name, hint in function.__annotations__.items() if name != "return"}
+        hinted = {name: hint for name, hint in declared.__annotations__.items() if name != "return"}
         given = types.SimpleNamespace(__annotations__=hinted)
-        hints = typing.get_type_hints(given, function.__globals__, include_extras=True)
+        hints = typing.get_type_hints(given, declared.__globals__, include_extras=True)
         parameters = self._signature.parameters.values()
         self._several = any(one.kind in (one.VAR_POSITIONAL, one.VAR_KEYWORD) for one in parameters)
         several = [one.name for one in parameters if one.kind is one.VAR_POSITIONAL]

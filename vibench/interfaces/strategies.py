@@ -14,12 +14,12 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from vibench.arrays import Array, Mask
-from vibench.errors import RequestError
+from vibench.arrays import Array, Mask, taken
+from vibench.errors import NumericalError, RequestError, placed
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
-from vibench.signatures import Count, NotNegative, bordered, constructed
+from vibench.signatures import Count, NotNegative, bordered, constructed, overridden
 
 
 @constructed
@@ -88,14 +88,22 @@ class Cone:
         return rays(self.generators, self.free)
 
 
-class DualStrategy(ABC):
-    """Builds a reduced cone from multiplier snapshots. Constructor arguments are the plugin's options."""
+class Strategy:
+    """What all strategies have. Arguments of the methods below are checked in every class that defines them."""
 
     requires: ClassVar[tuple[str, ...]] = ()
     """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
 
+    def __init_subclass__(cls, **named: Any) -> None:
+        super().__init_subclass__(**named)
+        overridden(cls, __name__)
+
+
+class DualStrategy(Strategy, ABC):
+    """Builds a reduced cone from multiplier snapshots. Constructor arguments are the plugin's options."""
+
     @abstractmethod
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Annotated[Array, "m", "P"], W: Annotated[InnerProduct, "m"], stop: Stop) -> Cone:
         """Cone for snapshots λ(mu_p) (m×P, coefficientwise nonnegative); `stop` bounds its projection error or size."""
 
 
@@ -173,11 +181,9 @@ class Enrichment:
             raise RequestError("a per-parameter enrichment, and no other, has either eta or a supply")
 
 
-class PrimalStrategy(ABC):
+class PrimalStrategy(Strategy, ABC):
     """Enriches the primal basis. Constructor arguments are the plugin's options."""
 
-    requires: ClassVar[tuple[str, ...]] = ()
-    """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
     takes_tolerance: ClassVar[bool] = False
     """Whether studies vary a tolerance of this strategy."""
     larger_is_tighter: bool = False
@@ -198,14 +204,12 @@ def no_free(count: Count) -> Mask:
     return np.zeros(count, dtype=bool)
 
 
-class Sampling(ABC):
+class Sampling(Strategy, ABC):
     """Chooses parameters. Constructor arguments are the plugin's options; every random choice has a seed among them.
 
     Options annotated as `pathlib.Path` are relative to the folder of the study file.
     """
 
-    requires: ClassVar[tuple[str, ...]] = ()
-    """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
     ordered: ClassVar[bool] = False
     """Whether the points are a path: then QP solvers that can start from a solution start from the one before."""
 
@@ -258,10 +262,11 @@ def check_sample(box: ParameterBox, returned: object) -> Array:
     Raises a `RequestError` if they have the wrong shape, are not finite, lie outside the box, occur twice, or are not
     among the listed ones of a problem that has no other.
     """
-    mus = np.array(returned, float)
-    mus.flags.writeable = False
+    mus = np.asanyarray(returned)
     if mus.ndim != 2 or mus.shape[1] != box.dim or not len(mus):
         raise RequestError(f"parameters of shape {mus.shape}; expected (P, {box.dim}), a row for each, with P > 0")
+    with placed("no parameters", NumericalError):
+        mus = taken(mus, "the array", "P", box.dim, finite=False)
     # Of every kind of fault the first one is named.
     for k, i in np.argwhere(~np.isfinite(mus))[:1]:
         raise RequestError(f"parameter {k} has '{box.names[i]}' = {mus[k, i]}, which is not finite")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import FunctionType
 from typing import cast
 
@@ -19,6 +19,7 @@ from vibench.offline.reduction import Reduction
 from vibench.plugins.plugin import Plugin
 from vibench.reduction.nested import Grown, Milestone, grow_through
 from vibench.reduction.supremizers import ConstraintClasses, projected_supremizers
+from vibench.signatures import inside
 from vibench.stability.infsup import ProjectedSupremizers
 from vibench.stages.artefacts import History, Store, storable
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
@@ -153,7 +154,8 @@ class SingleEnrichment(EnrichmentStage):
     def run(self, store: Store) -> Result:
         offline, strategy = _offline(store, self.pod, self.cone), self.primal.create()
         with faults_of(self.primal):
-            enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
+            given = replace(offline)
+            enrichment, seconds = timed(lambda: inside(strategy.build)(given, self.tolerance))
             enrichment = check_enrichment(enrichment, offline.problem.V, offline.basis)
         quantities = dict(enrichment.history)
         # The assessment on the training set is not timed.
