@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hashlib import sha256
 from numbers import Integral
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -21,6 +21,8 @@ Indices: TypeAlias = NDArray[np.intp]
 
 Mask: TypeAlias = NDArray[np.bool_]
 """A vector of truth values."""
+
+A = TypeVar("A", bound=NDArray[Any])
 
 
 def _is_matrix(value: Any) -> bool:
@@ -90,7 +92,7 @@ def is_count(value: object) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0
 
 
-def read_only(array: Array) -> Array:
+def read_only(array: A) -> A:
     """A view of an array into which nobody writes by chance."""
     view = array.view()
     view.flags.writeable = False

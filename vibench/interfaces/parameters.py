@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from vibench.arrays import Array, Mask
+from vibench.arrays import Array, Mask, read_only
 from vibench.errors import RequestError, unknown_name
 from vibench.signatures import AtLeastOne, Count, Seed, bordered
 from vibench.text import normal_name
@@ -38,6 +38,9 @@ class ParameterBox:
     listed: Annotated[Array, "L", "d"] | None = None
 
     def __post_init__(self) -> None:
+        # Problems share their box with all plugins.
+        for name in ("lower", "upper"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
         if (self.lower > self.upper).any():
             raise RequestError(f"lower bounds {self.lower.tolist()} are above the upper ones {self.upper.tolist()}")
 

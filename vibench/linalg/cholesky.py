@@ -15,7 +15,7 @@ from scipy.linalg.blas import dsyrk
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 
-from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.arrays import Array, Indices, SparseMatrix, read_only
 from vibench.errors import NumericalError
 from vibench.linalg import UNIT_ROUND_OFF
 from vibench.linalg.definite import BlockDiagonal, Factor, FactoredElimination, dense_cholesky, mirrored
@@ -53,8 +53,8 @@ class SparseCholesky(Factor):
         matrix = sp.csc_array(matrix)
         self._arguments = matrix, name
         self._lu, pivots = _pivots(matrix, "MMD_AT_PLUS_A", name)
-        self._root = np.sqrt(pivots)
-        self.order: Indices = np.argsort(self._lu.perm_c)
+        self._root = read_only(np.sqrt(pivots))
+        self.order: Indices = read_only(np.argsort(self._lu.perm_c))
 
     def __getstate__(self) -> dict[str, object]:
         return dict(zip(("matrix", "name"), self._arguments, strict=True))  # SuperLU objects cannot be stored

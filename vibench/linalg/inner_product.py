@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
 
-from vibench.arrays import Array, SparseMatrix, frozen
+from vibench.arrays import Array, SparseMatrix, frozen, read_only
 from vibench.errors import NumericalError, RequestError
 from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
@@ -87,7 +87,7 @@ class InnerProduct:
     @cached_property
     def dense(self) -> Array:
         """The matrix X as an array."""
-        return np.asarray(self.matrix.toarray())
+        return read_only(self.matrix.toarray())
 
     @bordered
     def factorised_by(self, name: str) -> None:

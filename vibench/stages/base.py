@@ -39,7 +39,7 @@ def faults_of(plugin: Plugin) -> Iterator[None]:
         raise NumericalError(f"{error}; run `{plugin.check}`") from error
     except (VibenchError, MemoryError):
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise NumericalError(f"the {plugin} raised {in_a_line(error)}; run `{plugin.check}`") from error
 
 

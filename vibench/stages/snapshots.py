@@ -282,16 +282,28 @@ def unchanged(stage: Stage) -> Iterator[None]:
     # Plugins of vibench change nothing, and cost nothing here.
     guests = [one for one in stage.plugins if one.kind is not PluginKind.PROBLEM and one.registered.package]
     problems = [one for one in stage.plugins if one.kind is PluginKind.PROBLEM] if guests else []
-    before = {plugin: fingerprint_here(plugin) for plugin in problems}
+    before = {plugin: (fingerprint_here(plugin), _parts_of(build_problem(plugin))) for plugin in problems}
     yield
-    for plugin, known in before.items():
+    # Where the stage is the first one of a plugin, no other has been at work.
+    earlier = {plugin for one in stage.inputs() for plugin in one.plugins}
+    for plugin, (known, parts) in before.items():
         try:
-            deviations = list(ReferenceAssembly(build_problem(plugin)).fingerprint.deviations(known))
+            problem = build_problem(plugin)
+            here = _parts_of(problem)
+            deviations = [f"{name} is replaced" for name, value in parts.items() if here.get(name) is not value]
+            deviations = deviations or list(ReferenceAssembly(problem).fingerprint.deviations(known))
         except NumericalError as error:
             deviations = [str(error)]
         for deviation in deviations:
-            who = f"the {' or the '.join(map(str, guests))} writes into what it is given"
-            raise NumericalError(f"{who}, and the {plugin} is another one since: {deviation}")
+            who = " or the ".join(str(one) for one in [one for one in guests if one not in earlier] or guests)
+            what = f"the {who} writes into what it is given"
+            raise NumericalError(f"{what}, and the {plugin} is another one since: {deviation}")
+
+
+def _parts_of(problem: Problem) -> dict[str, Any]:
+    """What no fingerprint looks at: the attributes of the spaces of a problem, and its own ones in place of methods."""
+    own = {name: vars(problem).get(name) for name, member in vars(Problem).items() if callable(member)}
+    return own | {f"{name}.{part}": value for name in "VW" for part, value in vars(getattr(problem, name)).items()}
 
 
 def gather(store: Store, chunks: tuple[Stage, ...]) -> TimedSnapshots:
