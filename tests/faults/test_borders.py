@@ -1,59 +1,106 @@
-"""Formulations that do all they can to their neighbours, beside two honest ones of their package."""
+"""Plugins that do all they can to their neighbours, beside honest ones of their package."""
 
+import os
+import signal
+import sys
+from contextlib import nullcontext
+
+import numpy as np
 import pandas as pd
 import pytest
 from fake_plugins import Wire
-from hostile import CHANGED, PHASES, Honest, HonestNearest, Hostile
+from hostile import (
+    ANYWHERE,
+    CHANGED,
+    DUAL,
+    PHASES,
+    PRIMAL,
+    PROBLEM,
+    Honest,
+    HonestCone,
+    HonestNearest,
+    HonestSpace,
+    Hostile,
+    HostileCone,
+    HostileSampling,
+    HostileSpace,
+    HostileWire,
+)  # fmt: skip
 from running import MEASURED
 
-from vibench import Run, Study, run
+from vibench import RequestError, Run, Study, run
 
-EXPECTED = {f"{phase}-{how}": said for phase, acts in PHASES.items() for how, (said, _) in acts.items()}
+FEW = {"solvers": ["piqp"], "dual": ["cpg"], "primal": ["decorrelated"], "tolerances": [{"pod": [0.1], "dual": [0.1]}]}
+
+KINDS = {
+    "formulation": (Hostile, PHASES), "dual": (HostileCone, DUAL), "primal": (HostileSpace, PRIMAL),
+    "problem": (HostileWire, PROBLEM),
+}  # fmt: skip
+EXPECTED = {
+    kind: {f"{phase}-{how}": said for phase, acts in phases.items() for how, (said, _) in acts.items()}
+    for kind, (_, phases) in KINDS.items()
+}
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Run]:
-    """The honest ones alone, and right after those that would make them wrong in silence."""
-    hows = sorted(EXPECTED, key=lambda how: EXPECTED[how] == CHANGED)
-    hostile = [{"name": Hostile, "label": how, "options": {"how": how}} for how in hows]
-    found, fair = [], [Honest, HonestNearest]
-    for number, formulations in enumerate((fair, [*hostile, *fair])):
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
+    """The honest ones alone, and after hostile plugins of every kind."""
+    found, fair = dict[str, Run](), [Honest, HonestNearest]
+    honest = {"problem": [Wire], "dual": [HonestCone], "primal": [HonestSpace], "formulation": fair}
+    for kind in ("", *KINDS):
+        axes = honest | {"formulation": fair if kind in ("", "formulation") else [Honest]}
+        # Last those that would make the honest ones wrong in silence.
+        for how in sorted(EXPECTED.get(kind, ()), key=lambda how: EXPECTED[kind][how] == CHANGED, reverse=True):
+            axes[kind] = [{"name": KINDS[kind][0], "label": how, "options": {"how": how}}, *axes[kind]]
         study = Study(
-            name="borders", seed=3, validation=2, problem=[Wire], formulation=formulations, dual=["cpg"],
-            primal=["decorrelated"], solvers=["piqp"], timing_rounds=1, limits={"query_seconds": 1.0},
-            tolerances=[{"pod": [1e-3], "dual": [1e-2]}],
+            name="borders", seed=3, validation=2, solvers=["piqp"], timing_rounds=1, limits={"query_seconds": 1.0},
+            tolerances=[{"pod": [1e-3], "dual": [1e-2]}], **axes,
         )  # fmt: skip
-        found.append(run(study, tmp_path_factory.mktemp(f"borders{number}"), jobs=1, fresh=True, progress=False))
-    return found[0], found[1]
+        found[kind] = run(study, tmp_path_factory.mktemp("borders"), jobs=1, fresh=True, progress=False)
+    return found
 
 
 @pytest.fixture(scope="module")
-def cells(runs: tuple[Run, Run]) -> pd.DataFrame:
-    return runs[1].table("cells").set_index("formulation")
+def cells(runs: dict[str, Run]) -> pd.DataFrame:
+    return runs["formulation"].table("cells").set_index("formulation")
 
 
-def honest(found: Run, table: str) -> pd.DataFrame:
+def honest(found: Run, table: str, formulations: list[str]) -> pd.DataFrame:
     rows = found.table(table)
-    mine = rows[rows["formulation"].isin(["Honest", "HonestNearest"])].reset_index(drop=True)
-    return mine[[name for name in mine if not name.endswith((*MEASURED, "study_hash"))]]
+    fair = {"problem": ["Wire"], "dual": ["HonestCone", "–"], "primal": ["HonestSpace", "–"]}
+    for axis, names in (fair | {"formulation": formulations}).items():
+        rows = rows[rows[axis].isin(names)]
+    return rows[[name for name in rows if not name.endswith((*MEASURED, "study_hash"))]].reset_index(drop=True)
 
 
-def test_honest_rows_are_those_of_a_run_alone(runs: tuple[Run, Run]) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_honest_rows_are_those_of_a_run_alone(runs: dict[str, Run], kind: str) -> None:
+    names = ["Honest", "HonestNearest"][: 2 if kind == "formulation" else 1]
     for table in ("cells", "queries"):
-        alone, beside = (honest(found, table) for found in runs)
-        assert len(alone) >= 2
+        alone, beside = (honest(runs[one], table, names) for one in ("", kind))
+        assert len(alone) >= len(names)
         assert set(alone["status"]) == {"ok"}
         pd.testing.assert_frame_equal(beside, alone, check_exact=True, check_dtype=False)
 
 
-def test_what_misbehaves_says_so_in_its_own_rows(cells: pd.DataFrame) -> None:
-    assert len(EXPECTED) >= 60
-    wrong = {}
-    for how, said in EXPECTED.items():
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_misbehaves_says_so_in_its_own_rows(runs: dict[str, Run], kind: str) -> None:
+    wrong, cells = {}, runs[kind].table("cells").set_index(kind)
+    for how, said in EXPECTED[kind].items():
         (status, _, words), found = said.partition(": "), cells.loc[how]
         if found["status"] != status or words not in found["reason"] or "\n" in found["reason"]:
             wrong[how] = found["status"], found["reason"]
     assert wrong == {}
+
+
+def test_what_a_sampling_does_to_the_process_of_the_command_is_undone() -> None:
+    for how, (said, _) in ANYWHERE.items():
+        if how not in ("exits", "dies"):
+            sampling = {"name": HostileSampling, "options": {"how": f"build-{how}"}}
+            before = sys.path[:], np.geterr(), signal.getsignal(signal.SIGTERM), os.environ.copy()
+            with pytest.raises(RequestError, match=said[7:]) if said.startswith("error") else nullcontext():
+                Study(name="borders", validation=2, problem=[{"name": Wire, "training": sampling}], **FEW)
+            assert before == (sys.path, np.geterr(), signal.getsignal(signal.SIGTERM), os.environ), how
 
 
 def test_a_buffer_that_is_filled_again_is_judged_by_what_it_held(cells: pd.DataFrame) -> None:

@@ -1,19 +1,43 @@
-"""Formulations that do all they can to their process and their neighbours, and two honest ones of the same package."""
+"""Plugins that do all they can to their process and their neighbours, and two honest formulations of their package."""
 
+import locale
 import os
+import random
 import signal
 import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
+from fake_plugins import Wire
 from formulations import Nearest, Program, ProgramModel
 
-from vibench import Array, FormulationAnswer, FormulationModel, HighFidelitySolver, OfflinePhase, QuerySettings
+from vibench import (
+    Array,
+    Cone,
+    DualStrategy,
+    Enrichment,
+    FormulationAnswer,
+    FormulationModel,
+    HighFidelitySolver,
+    InnerProduct,
+    Kind,
+    Offline,
+    OfflinePhase,
+    ParameterBox,
+    PrimalStrategy,
+    QuerySettings,
+    Sampling,
+    Stop,
+    VariationalInequality,
+    greedy_cone,
+    supremizers,
+)  # fmt: skip
 
 Acts = Mapping[str, tuple[str, Callable[[Any], Any]]]
 """What is done, by its name, and what its cell says of it: the status and words of the reason."""
@@ -41,6 +65,10 @@ def double(matrix: Any) -> None:
     matrix.data *= 2.0
 
 
+def replaced(owner: Any, name: str) -> None:
+    setattr(owner, name, copy(getattr(owner, name)))
+
+
 def vi(owner: Any) -> Any:
     return owner.problem.assemble(np.array([5.0]))
 
@@ -54,6 +82,9 @@ ANYWHERE: Acts = {
     "recursion": ("error: RecursionError", lambda _: sys.setrecursionlimit(5)),
     "warnings": ("ok: ", lambda _: warnings.simplefilter("error")), "folder": ("ok: ", lambda _: os.chdir("/")),
     "environment": ("ok: ", lambda _: os.environ.clear()),
+    "random": ("ok: ", lambda _: (random.seed(1), np.random.seed(1))),  # noqa: NPY002
+    "signals": ("ok: ", lambda _: [signal.signal(one, signal.SIG_IGN) for one in (signal.SIGTERM, signal.SIGUSR1)]),
+    "alarm": ("ok: ", lambda _: signal.alarm(1)), "locale": ("ok: ", lambda _: locale.setlocale(locale.LC_ALL, "C")),
     "thread": ("ok: ", lambda _: threading.Thread(target=hang, args=(0,), daemon=True).start()),
     "raises": ("error: ArithmeticError: no pivot", lambda _: throw(ArithmeticError("no pivot"))),
     "leaves": ("error: SystemExit: 3", lambda _: sys.exit(3)), "exits": ("crashed: exit code 3", lambda _: os._exit(3)),
@@ -64,7 +95,7 @@ BUILD: Acts = {
     "B": ("ok: ", lambda offline: double(vi(offline).B)),
     "indices": (CHANGED, lambda offline: fill(vi(offline).A.indices)),
     "multiplied": (CHANGED, lambda offline: vi(offline).A.__imul__(2.0)),
-    "box": (CHANGED, lambda offline: fill(offline.problem.parameters.lower)),
+    "box": ("error: read-only", lambda offline: fill(offline.problem.parameters.lower)),
     "depth": (CHANGED, lambda offline: setattr(offline.problem, "depth", 0.1)),
     "stiffness": (CHANGED, lambda offline: setattr(offline.problem, "stiffness", 2.0 * offline.problem.stiffness)),
     "method": ("error: is another one since", lambda offline: setattr(offline.problem, "assemble", lambda mu: None)),
@@ -74,6 +105,7 @@ BUILD: Acts = {
     "cone": ("error: read-only", lambda offline: fill(offline.cone.generators)),
     "span": ("error: read-only", lambda offline: fill(offline.multipliers.span)),
     "snapshots": ("ok: ", lambda offline: fill(offline.snapshots.u)),
+    "training": ("error: Wire' is another one since: training_set", lambda o: setattr(o.problem, "training_set", None)),
 }
 MODEL: Acts = {
     "true": ("error: `dimension` of the model is True", lambda made: setattr(made, "dimension", True)),
@@ -85,6 +117,7 @@ SOLVE: Acts = {
     "mu": ("error: read-only", lambda model: fill(model.mu)),
     "A": (CHANGED, lambda model: double(vi(model).A)),
     "slow": ("timeout: query_seconds = 1 s", hang),
+    "trivial": ("inaccurate: its last quadratic program: its solution is not the answer", lambda model: None),
 }
 ANSWER: Acts = {
     "tuple": ("error: `solve` returned a tuple", lambda one: (one.x, one.alpha)),
@@ -118,11 +151,127 @@ RECONSTRUCT: Acts = {
     "solves": ("ok: ", lambda model: None),
 }
 BUFFER = np.zeros(12)
+ENDS = {how: ANYWHERE[how] for how in ("raises", "leaves", "exits")}
+REDUCE: Acts = {
+    "snapshots": ("ok: ", lambda given: fill(given[0])),
+    "W": ("error: read-only", lambda given: double(given[1].matrix)),
+    "dense": ("error: read-only", lambda given: fill(given[1].dense)),
+    "factor": ("error: W._factor is replaced", lambda given: replaced(given[1], "_factor")),
+    "matrix": (CHANGED, lambda given: setattr(given[1], "matrix", 2.0 * given[1].matrix)),
+    "stop": ("ok: ", lambda given: object.__setattr__(given[2], "tolerance", 1.0)),
+}
+CONE: Acts = {
+    "buffer": ("ok: ", lambda cone: replace(cone, generators=kept(cone.generators))),
+    "forged": ("error: `errors` of the cone has the type", lambda cone: forged(cone, "errors", None)),
+    "words": ("error: raised TypeError: 'int'", lambda cone: forged(cone, "fallbacks", 5)),
+}
+ENRICH: Acts = {
+    "A": (CHANGED, lambda offline: double(vi(offline).A)),
+    "basis": ("error: read-only", lambda offline: fill(offline.basis)),
+    "span": ("error: read-only", lambda offline: fill(offline.span)),
+    "training": ("error: read-only", lambda offline: fill(offline.training)),
+    "phase": ("ok: ", lambda offline: object.__setattr__(offline, "basis", offline.basis[:, :1])),
+    "V": (
+        "error: V._solver is replaced",
+        lambda offline: setattr(offline.problem.V, "_solver", copy(offline.problem.V._solver)),
+    ),
+    "spaces": ("error: read-only", lambda offline: fill(offline.problem.V._factor._root)),
+}
+VECTORS: Acts = {
+    "buffer": ("ok: ", lambda one: replace(one, vectors=kept(one.vectors))),
+    "history": ("error: history of Enrichment is {'x': nan}", lambda one: replace(one, history={"x": np.nan})),
+    "supply": (CHANGED, lambda one: Enrichment(Kind.PER_PARAMETER, supply=doubling)),
+}
+PARAMETERS: Acts = {"box": ("error: read-only", lambda given: fill(given.parameters.lower))}
+ASSEMBLE: Acts = {"mu": ("error: read-only", fill)}
 
 PHASES = {
-    "build": BUILD | ANYWHERE, "model": MODEL, "solve": SOLVE | ANYWHERE, "answer": ANSWER, "pair": PAIR,
+    "build": BUILD | ANYWHERE, "model": MODEL, "solve": SOLVE | ENDS, "answer": ANSWER, "pair": PAIR,
     "reconstruct": RECONSTRUCT | {how: ANYWHERE[how] for how in ("raises", "exits")},
 }  # fmt: skip
+DUAL = {"reduce": REDUCE | {how: ANYWHERE[how] for how in ("path", "thread", "alarm", "exits", "leaves")}, "cone": CONE}
+PRIMAL = {"enrich": ENRICH | {how: ANYWHERE[how] for how in ("signals", "random", "exits")}, "vectors": VECTORS}
+PROBLEM = {
+    "init": {how: ANYWHERE[how] for how in ("folder", "leaves")},
+    "parameters": PARAMETERS | ENDS, "assemble": ASSEMBLE | {how: ANYWHERE[how] for how in ("errors", "exits")},
+}  # fmt: skip
+ACTS = PHASES | DUAL | PRIMAL | PROBLEM
+
+
+def kept(array: Array) -> Array:
+    """The same in a buffer that the next call fills again."""
+    BUFFERS[:, : array.shape[1]] = array
+    return BUFFERS[:, : array.shape[1]]
+
+
+BUFFERS = np.zeros((12, 12))
+
+
+def forged(made: Any, name: str, value: Any) -> Any:
+    object.__setattr__(made, name, value)
+    return made
+
+
+def doubling(V: InnerProduct, vi: VariationalInequality, span: Array) -> Array:
+    double(vi.A)
+    return np.ones((V.dim, 1))
+
+
+class HonestCone(DualStrategy):
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        return greedy_cone(snapshots, W, stop)
+
+
+class HonestSpace(PrimalStrategy):
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        V, B = offline.problem.V, offline.problem.constraint(offline.training[0])[0]
+        return Enrichment(Kind.FIXED, vectors=V.orthonormalise(supremizers(V, B, offline.span), offline.basis))
+
+
+class HostileCone(HonestCone):
+    def __init__(self, how: str) -> None:
+        self.how = how
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        cone = super().reduce(snapshots, W, stop)
+        act(self.how, "reduce", (snapshots, W, stop))
+        return act(self.how, "cone", cone, cone)
+
+
+class HostileSpace(HonestSpace):
+    def __init__(self, how: str) -> None:
+        self.how = how
+
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        enrichment = super().build(offline, tolerance)
+        act(self.how, "enrich", offline)
+        return act(self.how, "vectors", enrichment, enrichment)
+
+
+class HostileWire(Wire):
+    def __init__(self, how: str) -> None:
+        self.how = how
+        act(how, "init", self)
+        super().__init__()
+
+    def training_set(self) -> Array:
+        act(self.how, "parameters", self)
+        return super().training_set()
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        act(self.how, "assemble", mu)
+        return super().assemble(mu)
+
+
+class HostileSampling(Sampling):
+    """It chooses parameters in the process of the command, too, which refuses what raises."""
+
+    def __init__(self, how: str) -> None:
+        self.how = how
+
+    def parameters(self, box: ParameterBox) -> Array:
+        act(self.how, "build", box)
+        return box.grid(5)
 
 
 class Hostile(Program):
@@ -147,7 +296,7 @@ def act(how: str, phase: str, given: Any, otherwise: Any = None) -> Any:
     own, name = how.split("-")
     if own != phase:
         return otherwise
-    done = PHASES[phase][name][1](given)
+    done = ACTS[phase][name][1](given)
     return otherwise if phase == "build" else done
 
 
@@ -159,6 +308,9 @@ class HostileModel(ProgramModel):
         self.mu = mu
         act(self.how, "solve", self)
         answer = super().solve(mu, settings)
+        if self.how == "solve-trivial":
+            zeros = np.zeros((1, 1)), np.zeros(1)
+            settings.solve_qp(VariationalInequality(np.eye(1), zeros[1], zeros[0], zeros[1]))
         return act(self.how, "answer", answer, answer)
 
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> Any:
