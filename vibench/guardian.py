@@ -33,7 +33,7 @@ def _line(process: int) -> tuple[int, int]:  # noqa: ARG001  a forked process ha
 
 
 def fork() -> int:
-    """As `os.fork`, but the new process leads a group, has a mark of its own, and ends with this one."""
+    """Fork a process that leads a group, has a mark of its own, and ends with this one; as `os.fork`."""
     line = _line(os.getpid())
     if process := os.fork():
         return process

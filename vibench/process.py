@@ -7,6 +7,7 @@ import os
 import random
 import signal
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -31,6 +32,8 @@ def put_back() -> Iterator[list[str]]:
 def _state() -> dict[str, tuple[Any, Callable[[Any], object]]]:
     """The state as it is now, and how every part is put back."""
     name, key, *rest = np.random.get_state()  # noqa: NPY002  plugins may use it
+    left = signal.getitimer(signal.ITIMER_REAL)[0]
+    ends = left and round(time.monotonic() + left, -2)
     handlers = {number: signal.getsignal(number) for number in signal.valid_signals()}
     return {
         "sys.path": (sys.path[:], lambda known: setattr(sys, "path", known)),
@@ -43,7 +46,7 @@ def _state() -> dict[str, tuple[Any, Callable[[Any], object]]]:
         "the state of numpy.random": ((name, np.asarray(key).tolist(), *rest), np.random.set_state),
         "the handlers of signals": (handlers, _set_handlers),
         # A timer that goes off later ends the work of others.
-        "the timer": (any(signal.getitimer(signal.ITIMER_REAL)), lambda _: signal.setitimer(signal.ITIMER_REAL, 0.0)),
+        "the timer": (ends, lambda known: signal.setitimer(signal.ITIMER_REAL, known and known - time.monotonic())),
         "the locale": (locale.setlocale(locale.LC_ALL), lambda known: locale.setlocale(locale.LC_ALL, known)),
     }
 

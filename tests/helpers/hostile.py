@@ -105,7 +105,10 @@ BUILD: Acts = {
     "cone": ("error: read-only", lambda offline: fill(offline.cone.generators)),
     "span": ("error: read-only", lambda offline: fill(offline.multipliers.span)),
     "snapshots": ("ok: ", lambda offline: fill(offline.snapshots.u)),
-    "training": ("error: Wire' is another one since: training_set", lambda o: setattr(o.problem, "training_set", None)),
+    "training": (
+        "error: Wire' is another one since: training_set",
+        lambda o: setattr(o.problem, "training_set", throw),
+    ),
 }
 MODEL: Acts = {
     "true": ("error: `dimension` of the model is True", lambda made: setattr(made, "dimension", True)),
@@ -157,7 +160,7 @@ REDUCE: Acts = {
     "W": ("error: read-only", lambda given: double(given[1].matrix)),
     "dense": ("error: read-only", lambda given: fill(given[1].dense)),
     "factor": ("error: W._factor is replaced", lambda given: replaced(given[1], "_factor")),
-    "matrix": (CHANGED, lambda given: setattr(given[1], "matrix", 2.0 * given[1].matrix)),
+    "matrix": ("error: W.matrix is replaced", lambda given: setattr(given[1], "matrix", 2.0 * given[1].matrix)),
     "stop": ("ok: ", lambda given: object.__setattr__(given[2], "tolerance", 1.0)),
 }
 CONE: Acts = {

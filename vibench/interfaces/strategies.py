@@ -89,7 +89,7 @@ class Cone:
 
 
 class Strategy:
-    """What all strategies have. Arguments of the methods below are checked in every class that defines them."""
+    """Base of all strategies: arguments of the methods below are checked in every class that defines them."""
 
     requires: ClassVar[tuple[str, ...]] = ()
     """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""

@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.errors import NumericalError
+from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.strategies import Enrichment, Kind, Offline, PrimalStrategy
 from vibench.timing import Seconds, Stopwatch
 
@@ -46,7 +46,7 @@ class NestedStrategy(PrimalStrategy):
     def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
         """Grow until the tolerance is reached; raises a `NumericalError` that says why it was not."""
         if tolerance is None:
-            raise ValueError(f"{type(self).__name__} needs a tolerance")
+            raise RequestError(f"{type(self).__name__} needs a tolerance")
         grown = grow_through(self, offline, [tolerance])
         return grown.at(grown.milestone(tolerance))
 

@@ -90,7 +90,9 @@ def right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         "greedy_cone.snapshots": np.eye(3, 4), "Snapshots.u": np.eye(5, 4), "Snapshots.lam": np.eye(3, 4),
         "solve_qp.start": None, "HighFidelitySolver.remember.solution": solver.solve(mu), "Offline.generators": size,
         "ParameterBox.units": two, "check_enrichment.basis": reduction.pod.basis, "check_enrichment.V": pack.V,
-        "check_cone.W": pack.W, "Run.report.path": Path("r.html"), "Offline.basis": reduction.pod.basis,
+        "mcpg.reduce.snapshots": np.eye(3, 4), "offline-pga.build.offline": reduction.offline,
+        "offline-pga.build.tolerance": 0.5, "check_cone.W": pack.W,
+        "Run.report.path": Path("r.html"), "Offline.basis": reduction.pod.basis,
         "Offline.span": reduction.cone.generators, "Offline.training": mu[None], "pack_digest.path": str(folder),
         "read_model_pack.path": str(folder),
     }  # fmt: skip
@@ -129,6 +131,8 @@ def called(instances: dict[type, Any]) -> Iterator[tuple[str, Callable[..., Any]
                 if inspect.isfunction(member) and method[0] != "_":
                     yield f"{name}.{method}", getattr(instances[found], method)
     yield from ((name, getattr(vibench.packs, name)) for name in ("read_model_pack", "pack_digest"))
+    for kind, name, method in (("dual", "mcpg", "reduce"), ("primal", "offline-pga", "build")):
+        yield f"{name}.{method}", getattr(vibench.create(f"{kind} strategy", name), method)
 
 
 def fits(value: Any, right: Any, parameter: inspect.Parameter) -> bool:
