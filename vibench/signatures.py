@@ -109,7 +109,7 @@ class _Signature:
         hints = typing.get_type_hints(given, declared.__globals__, include_extras=True)
         parameters = self._signature.parameters.values()
         self._several = any(one.kind in (one.VAR_POSITIONAL, one.VAR_KEYWORD) for one in parameters)
-        several = [one.name for one in parameters if one.kind is one.VAR_POSITIONAL]
+        several = [one.name for one in parameters if one.kind is one.VAR_POSITIONAL and one.name in hints]
         hints |= {name: types.GenericAlias(tuple, (hints[name], ...)) for name in several}
         self._rules = {one.name: (rule_of(hints.get(one.name, Any)), one.default) for one in parameters}
         if owner is not None:
