@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from hashlib import sha256
-from numbers import Integral
 from typing import Annotated, Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -85,11 +84,6 @@ def taken(value: object, what: str, *shape: int | str, finite: bool = True) -> A
 def is_sound(array: Array | None) -> bool:
     """Whether there is no array, or its entries and the squares of their sums are finite."""
     return array is None or bool(np.max(np.abs(array), initial=0.0) < 1e100)
-
-
-def is_count(value: object) -> bool:
-    """Whether a value is a whole number of at least 0, which a truth value is not."""
-    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0
 
 
 def read_only(array: A) -> A:

@@ -58,8 +58,8 @@ NeverConverges = _answering(
     "NeverConverges", lambda answer, mu: replace(answer, outcome=Outcome.INACCURATE, reason="100 steps were too few")
 )
 SaysNotWhy = _answering("SaysNotWhy", lambda one, mu: replace(one, outcome=Outcome.FAILED if mu[0] > 0 else Outcome.OK))
-Rolls = _answering("Rolls", lambda one, mu: replace(one, x=one.x * (1.0 + 1e-9 * np.random.default_rng().random())))
 WrongSide = _rebuilding("WrongSide", lambda u, lam: (-u, lam))
+Rolls = _rebuilding("Rolls", lambda u, lam: (u * (1.0 + 1e-9 * np.random.default_rng().random()), lam))
 
 
 class RemembersItsScale(Program):
@@ -70,12 +70,11 @@ class RemembersItsScale(Program):
 
 
 class _ScaledModel(ProgramModel):
-    scale = 1.0
+    scale = 0.0
 
     def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
-        answer = super().solve(mu, settings)
-        self.scale = float(np.linalg.norm(answer.x))
-        return replace(answer, x=answer.x / self.scale)
+        self.scale = 1.0
+        return super().solve(mu, settings)
 
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
         u, lam = super().reconstruct(mu, answer)

@@ -68,9 +68,7 @@ _variant, _changed, _built = (partial(make, __name__) for make in (variant, chan
 
 Asymmetric = _changed("Asymmetric", "A", lambda A, mu, _: A + sp.csr_array(([1e-3 * mu[0]], ([2], [3])), shape=A.shape))
 Indefinite = _changed("Indefinite", "A", lambda A, mu, wire: A - 4.0 * (mu[0] - 4.0) * Wire().mass / 0.9)
-NotFinite = _changed("NotFinite", "f", lambda f, mu, wire: np.where(np.arange(len(f)) == 7, np.nan, f), above=5.0)
 InfiniteMatrix = _changed("InfiniteMatrix", "B", lambda B, mu, wire: B + sp.csr_array(([np.inf], ([5], [5])), B.shape))
-WrongShape = _changed("WrongShape", "B", lambda B, mu, wire: B[:, :-1])
 Integers = _changed("Integers", "g", lambda g, mu, wire: np.zeros(len(g), dtype=int))
 Column = _changed("Column", "f", lambda f, mu, wire: f[:, None])
 Dense = _changed("Dense", "A", lambda A, mu, wire: A.toarray())
@@ -79,11 +77,7 @@ RowList = _changed("RowList", "B", lambda B, mu, wire: B.tolil())
 Jumps = _changed("Jumps", "g", lambda g, mu, wire: 1.01 * g, above=5.4321)
 # At one force alone it is another wire.
 JumpsAtTheCentre = _changed("JumpsAtTheCentre", "A", lambda A, mu, wire: 2.0 * A if mu[0] == 6.0 else A)
-Random = _changed("Random", "f", lambda f, mu, wire: f * (1.0 + 1e-15 * np.random.default_rng().random(len(f))))
-# The wire is pulled off its support.
-WrongSign = _changed("WrongSign", "B", lambda B, mu, wire: -B)
 
-FalselyConstant = _variant("FalselyConstant", constant=frozenset({"A", "f"}))
 ConstantOfNothing = _variant("ConstantOfNothing", constant=frozenset({"a"}))
 ConstantText = _variant("ConstantText", constant="A")
 SamplesNothing = _variant("SamplesNothing", entrywise=frozenset({"f"}))
@@ -129,11 +123,8 @@ PartlyWrong = _variant(
     "PartlyWrong", Declared, contact=lambda self, mu: Contact(-self.mass, Declared.contact(self, mu).g * (1.0 + 1e-6))
 )
 PaintsNothing = _variant(
-    "PaintsNothing", Declared,
-    picture=lambda self, mu, u, lam: replace(
-        Declared.picture(self, mu, u, lam), triangles=np.array([[0], [1], [len(u)]]), values=u[:-1]
-    ),
-)  # fmt: skip
+    "PaintsNothing", Declared, picture=lambda self, mu, u, lam: Declared.picture(self, mu, u[1:], lam[1:])
+)
 NoContact = _variant("NoContact", Declared, contact=lambda self, mu: None)
 # B touches an unknown that is not declared.
 Overlooked = _variant("Overlooked", Declared, contact_dofs=property(lambda self: np.arange(1, self.V.dim)))
@@ -145,12 +136,6 @@ class IndefiniteNorm(Wire):
     def __init__(self) -> None:
         super().__init__()
         self.V = InnerProduct(self.stiffness - 1e3 * self.mass)
-
-
-class IndefiniteDualNorm(Wire):
-    def __init__(self) -> None:
-        super().__init__()
-        self.W = InnerProduct(self.mass - 2.0 * self.step * sp.eye_array(self.mass.shape[0]), "X_W")
 
 
 NoSpace = _built("NoSpace", V=lambda wire: wire.stiffness)

@@ -51,7 +51,6 @@ LastErrorAlone = _reducing(
     "LastErrorAlone", lambda cone, W: replace(cone, generators=cone.generators[:, ::-1].copy(), errors=cone.errors[-1:])
 )
 OneErrorTooFew = _reducing("OneErrorTooFew", lambda c, W: replace(c, errors=c.errors[1:]) if c.size > 1 else c)
-Long = _reducing("Long", lambda cone, W: replace(cone, generators=cone.generators * 2.0))
 Draws = _reducing("Draws", _drawn)
 # Stops at twice the tolerance, and says so.
 Misses = _stopping("Misses", lambda stop: stop if stop.tolerance is None else Stop(tolerance=2.0 * stop.tolerance))

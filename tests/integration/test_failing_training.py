@@ -88,8 +88,6 @@ def test_no_more_than_a_tenth_is_skipped_and_such_cells_are_others() -> None:
     count = "2 of 15 training parameters have no solution, at most 1 may be skipped"
     with pytest.raises(NumericalError, match=rf"{count}; the first one: at mu = \[1.0, -1.0\]: ValueError"):
         reduction(Tangled(0, 2), "skip").snapshots  # noqa: B018
-    with pytest.raises(RequestError, match="on_failure of Reduction is 'ignore', expected 'stop' or 'skip'"):
-        reduction(Declared(), "ignore")
     with pytest.raises(RequestError, match="on_failure is for training sets"):
         study("own", validation={"name": "sobol", "size": 4, "on_failure": "skip"})
     with pytest.raises(RequestError, match="chooses training parameters by what solutions know; it has none to skip"):

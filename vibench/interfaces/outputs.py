@@ -74,6 +74,7 @@ class Output:
             raise NumericalError(f"the output '{self.name}' fails at mu = {mu.tolist()}: {in_a_line(error)}") from error
 
 
+@constructed
 @dataclass(frozen=True)
 class Picture:
     """A solution to be drawn.
@@ -92,14 +93,23 @@ class Picture:
         Unit of the coordinates; "" where it is not said.
     """
 
-    points: Array
-    triangles: Indices
-    values: Array
+    points: Annotated[Array, "dimension", "p"]
+    triangles: Annotated[Indices, "corners", "t"]
+    values: Annotated[Array, "p"]
     name: str
-    positions: Array
-    multiplier: Array
+    positions: Annotated[Array, "k", "m"]
+    multiplier: Annotated[Array, "m"]
     multiplier_name: str
     length_unit: str = ""
+
+    def __post_init__(self) -> None:
+        for name, right in (("points", (1, 2)), ("positions", (1, 2)), ("triangles", (3,))):
+            if (rows := len(getattr(self, name))) not in right:
+                raise RequestError(f"{name} of Picture has {rows} rows, expected {' or '.join(map(str, right))}")
+        corners, count = self.triangles, self.points.shape[1]
+        if corners.size and (corners.min() < 0 or corners.max() >= count):
+            refers = f"refers to points {corners.min()} to {corners.max()}"
+            raise RequestError(f"triangles of Picture {refers}; there are {count}")
 
 
 @dataclass(frozen=True)

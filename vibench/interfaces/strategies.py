@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from vibench.arrays import Array, Mask, taken
+from vibench.arrays import Array, Mask, read_only, taken
 from vibench.errors import NumericalError, RequestError, placed
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Problem, VariationalInequality
@@ -76,6 +76,10 @@ class Cone:
     errors: Annotated[Array, "k"]
     free: Annotated[Mask, "R"]
     fallbacks: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("generators", "errors", "free"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
     @property
     def size(self) -> int:
@@ -140,6 +144,11 @@ class Offline:
     cone: Cone
     span: Annotated[Array, "m", "rank"]
     training: Annotated[Array, "P", "d"]
+
+    def __post_init__(self) -> None:
+        # Strategies share them.
+        for name in ("basis", "span", "training"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
 
 Supply = Callable[[InnerProduct, VariationalInequality, Array], Array]

@@ -19,7 +19,6 @@ from vibench.interfaces.absent_rows import ABSENT, is_absent, settled_bounds
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, Sampling, check_sample
 from vibench.linalg.inner_product import InnerProduct
-from vibench.text import shown
 
 
 def check_cone(cone: object, W: InnerProduct) -> Cone:
@@ -31,8 +30,6 @@ def check_cone(cone: object, W: InnerProduct) -> Cone:
     if len(errors) not in (1, R + 1) or errors.min() < 0.0:
         expected = f"expected e(0) … e({R}), or e({R}) alone, none negative"
         raise NumericalError(f"`errors` of the cone has shape {errors.shape}; {expected}")
-    if not isinstance(cone.free, np.ndarray) or cone.free.dtype != bool or cone.free.shape != (R,):
-        raise NumericalError(f"`free` of the cone is {shown(cone.free)}, expected {R} truth values")
     norms = W.norm(chi)
     away = np.abs(norms - 1.0)
     # Strategies normalise by norms with round-off of their own: half of the digits are asked for.

@@ -11,12 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from math import inf
-from numbers import Real
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
 
 import numpy as np
 
-from vibench.arrays import Array, is_count, is_sound, read_only, taken
+from vibench.arrays import Array, is_sound, read_only, taken
 from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces import formulations
@@ -38,7 +37,7 @@ from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers, solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
-from vibench.signatures import Judged, Positive, Share, bordered, constructed
+from vibench.signatures import Count, Judged, NotNegative, Positive, Share, bordered, constructed, rule_of
 from vibench.text import normal_name, shown
 from vibench.timing import NO_TIME, Seconds, timed
 
@@ -172,8 +171,8 @@ class Model:
             raise NumericalError(f"the formulation made a {type(made).__name__}, expected a FormulationModel")
         dimension, added = getattr(made, "dimension", None), made.enrichment or 0
         for name, size in (("dimension", dimension), ("generators", made.generators or 0), ("enrichment", added)):
-            if not is_count(size):
-                raise NumericalError(f"`{name}` of the model is {shown(size)}, expected a whole number of at least 0")
+            if not (rule := rule_of(Count)).holds(size):
+                raise NumericalError(f"`{name}` of the model is {shown(size)}, expected {rule.right}")
         if added > made.dimension:
             raise NumericalError(f"`enrichment` of the model is {shown(added)}, more than its `dimension`, {dimension}")
         if self.formulation.has_program and not hasattr(made, "reduced"):
@@ -507,15 +506,10 @@ def _taken(answer: object, model: FormulationModel) -> FormulationAnswer:
         vectors[name] = None if value is None else taken(value, f"{name} of the answer", "count", finite=False)
         if value is not None and len(value) > most:
             raise NumericalError(f"{name} of the answer has {len(value)} coefficients, the model declares {most}")
-    steps, estimate = answer.iterations, 0.0 if answer.uncertainty is None else answer.uncertainty
-    for name, fine, right in (
-        ("outcome", isinstance(answer.outcome, formulations.Outcome), "a vibench.Outcome"),
-        ("reason", isinstance(answer.reason, str), "a text"),
-        ("iterations", steps is None or is_count(steps), "a whole number"),
-        ("uncertainty", isinstance(estimate, Real) and 0.0 <= float(estimate) < inf, "a number of at least 0"),
-    ):  # fmt: skip
-        if not fine:
-            raise NumericalError(f"{name} of the answer is {shown(getattr(answer, name))}, expected {right}")
+    kinds = {"outcome": formulations.Outcome, "reason": str, "iterations": Count | None}
+    for name, kind in (kinds | {"uncertainty": NotNegative | None}).items():
+        if not (rule := rule_of(kind)).holds(value := getattr(answer, name)):
+            raise NumericalError(f"{name} of the answer is {shown(value)}, expected {rule.right}")
     return replace(answer, x=vectors["x"], alpha=vectors["alpha"])
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from vibench.errors import RequestError
 from vibench.interfaces.outputs import Picture
 from vibench.results.sqlite import read_rows
 from vibench.text import printable
@@ -18,7 +19,7 @@ from vibench.text import printable
 
 def members(arrays: bool) -> list[str]:
     """Members of a picture that hold arrays, or those that are texts."""
-    return [field.name for field in fields(Picture) if (field.type in {"Array", "Indices"}) is arrays]
+    return [field.name for field in fields(Picture) if (field.type != "str") is arrays]
 
 
 def picture_rows(drawn: Iterable[tuple[str, Picture]]) -> list[dict[str, Any]]:
@@ -55,4 +56,9 @@ def read(path: Path) -> Iterator[Shown]:
             kinds = {name: np.intp if name == "triangles" else float for name in members(arrays=True)}
             parts: dict[str, Any] = {name: stored[name].astype(kind) for name, kind in kinds.items()}
         texts = (printable(str(text)) for text in json.loads(row["names"]))
-        yield Shown(key, title, Picture(**parts | dict(zip(members(arrays=False), texts, strict=True))), reason)
+        try:
+            picture = Picture(**parts | dict(zip(members(arrays=False), texts, strict=True)))
+        except RequestError as error:
+            yield Shown(key, title, None, str(error))
+        else:
+            yield Shown(key, title, picture, reason)

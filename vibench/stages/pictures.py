@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from vibench.errors import NumericalError
 from vibench.interfaces.outputs import Picture
 from vibench.plugins.plugin import Plugin
 from vibench.results.pictures import members
@@ -50,27 +50,7 @@ class PictureStage(Stage):
             if picture is not None:
                 named = zip(box.names, solutions.mu[k], box.units, strict=True)
                 texts = (f"{name} = {mu:.3g}" + f" {unit}" * (unit not in ("", "1")) for name, mu, unit in named)
-                pictures.append((", ".join(texts), _checked(picture)))
+                names: dict[str, Any] = {name: one_line(getattr(picture, name)) for name in members(arrays=False)}
+                # Copy: the next picture may reuse the arrays.
+                pictures.append((", ".join(texts), deepcopy(replace(picture, **names))))
         return Result(tuple(pictures))
-
-
-def _checked(picture: Picture) -> Picture:
-    """A picture whose arrays hold real numbers and fit together, and whose names are texts."""
-    mistyped = [name for name in members(arrays=True) if getattr(picture, name).dtype.kind not in "fiu"]
-    mistyped += [name for name in members(arrays=False) if not isinstance(getattr(picture, name), str)]
-    if mistyped:
-        raise NumericalError(f"the problem's picture has {' and '.join(mistyped)} of the wrong type")
-    points, corners, positions = picture.points, picture.triangles, picture.positions
-    count = points.shape[-1]
-    mesh = corners.shape[0] == 3 and bool(np.all((corners >= 0) & (corners < count)))
-    fits = {
-        "points": points.ndim == 2 and len(points) in (1, 2), "triangles": len(points) == 1 or mesh,
-        "values": picture.values.shape == (count,), "positions": positions.ndim == 2 and len(positions) in (1, 2),
-        "multiplier": picture.multiplier.shape == positions.shape[-1:],
-    }  # fmt: skip
-    wrong = [name for name, right in fits.items() if not right]
-    if wrong:
-        raise NumericalError(f"the problem's picture has {' and '.join(wrong)} of the wrong shape")
-    # Copy: the next picture may reuse the arrays.
-    own: dict[str, Any] = {name: getattr(picture, name).copy() for name in members(arrays=True)}
-    return replace(picture, **own | {name: one_line(getattr(picture, name)) for name in members(arrays=False)})

@@ -301,7 +301,7 @@ def unchanged(stage: Stage) -> Iterator[None]:
 
 
 def _parts_of(problem: Problem) -> dict[str, Any]:
-    """What no fingerprint looks at: the attributes of the spaces of a problem, and its own ones in place of methods."""
+    """Parts that no fingerprint looks at: attributes of its spaces, and its own ones in place of methods."""
     own = {name: vars(problem).get(name) for name, member in vars(Problem).items() if callable(member)}
     return own | {f"{name}.{part}": value for name in "VW" for part, value in vars(getattr(problem, name)).items()}
 

@@ -35,7 +35,7 @@ Arrays = dict[str, Any]  # dense arrays and sparse matrices by name
 class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
     """A plugin under examination, the arguments it is called with, and the results."""
 
-    # Every call receives copies, so that a plugin that writes to its input fails the check "no mutation" alone.
+    # Every call receives arrays that are read-only: whoever writes into them says so by an error at that line.
     base: ClassVar[type]
     checks: ClassVar[tuple[Check[Any], ...]]
     round_off: ClassVar[float] = 0.0  # largest relative difference that arrays of another process may have

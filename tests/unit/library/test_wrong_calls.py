@@ -79,7 +79,7 @@ def right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     own: dict[str, Any] = {f"Study.{name}": value for name, value in STUDY.items()}
     own |= {
         "InnerProduct.gram.u": np.ones((5, 1)), "InnerProduct.gram.v": np.ones((5, 1)), "Reduction.generators": size,
-        "InnerProduct.orthonormalise.u": np.ones((5, 1)), "Output.u": mu, "Output.lam": mu, "Run.figure.dual": "wide",
+        "InnerProduct.orthonormalise.u": np.ones((5, 1)), "Output.u": mu, "Output.lam": mu,
         "InnerProduct.name": "X", "Output.name": "X", "Output.unit": "X", "Run.table.name": "cells",
         "create.kind": "problem", "Run.figure.problem": "membrane", "Run.break_even.error": "u",
         "create.name": "radial-obstacle", "run.observer": None, "Reduction.tolerance": None, "Reduction.primal": None,
@@ -185,7 +185,7 @@ def test_messages_name_the_argument_and_what_is_right(tmp_path: Path) -> None:
     one, no_number = Stop(size=1), np.full((5, 1), np.nan)
     for call, words in (
         (lambda: run.write_figures(formats="x"), "formats of Run.write_figures is 'x', expected a sequence of 'png'"),
-        (lambda: run.figure("convergence", "membrane", "widde"), "no dual strategy is called 'widde'; did you mean"),
+        (lambda: run.figure("convergence", "membran"), "no problem is called 'membran'; did you mean 'membrane'"),
         (lambda: Stop(toleranc=0.1), "no argument of Stop is called 'toleranc'; did you mean 'tolerance'"),
         (lambda: vibench.Reduction.given(None, snapshot=None), "no step of a Reduction is called 'snapshot'; did you"),
         (lambda: vibench.ParameterBox(("a",), np.ones(1), np.zeros(1), ("1",)), "[1.0] are above the upper ones [0.0]"),

@@ -112,11 +112,9 @@ def test_what_is_asked_for_wrongly_is_one_line(reduce: partial[vibench.Reduction
     right = reduce()
     for wrong, line in (
         ({"problem": type(right.problem)}, r"problem of Reduction is the class \w+, expected a Problem"),
-        ({"dual": "mcpg"}, "dual of Reduction is 'mcpg', expected a DualStrategy"),
         ({"modes": 1e-3}, r"modes of Reduction is 0\.001, expected a Stop"),
         ({"tolerance": None}, "OfflinePGA needs a tolerance"),
         ({"primal": None}, "without a primal strategy there is no tolerance"),
-        ({"assembly": "fulll"}, "assembly of Reduction is 'fulll', expected 'full' or 'reduced'"),
     ):
         with pytest.raises(vibench.RequestError, match=line):
             replace(right, **wrong)

@@ -224,6 +224,7 @@ def test_labels_and_options_tell_objects_and_classes_apart(names: dict[str, Any]
         ("Mine", "{}"), ("Mine", '{"nodes": 9}'), ("6 nodes", "{}"), ("8 nodes", "{}"),
     ]  # fmt: skip
     assert len({cell.key for cell in cells}) == 4
+    assert Plugin(PluginKind.DUAL, "x", '{"how": "y"}', "").check == "vibench check dual:x --option=how=y"
     assert [cell.problem.create().V.dim for cell in cells] == [12, 9, 6, 8]
 
 

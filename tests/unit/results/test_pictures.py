@@ -1,15 +1,14 @@
 """Pictures: of the right solutions, the same when read back, and a reason where there is none."""
 
-from collections.abc import Callable
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_plugins import Wire
 from samples import SampleStore, carry_out
 
-from vibench.arrays import Array
-from vibench.errors import NumericalError
+from vibench.errors import RequestError
 from vibench.interfaces.outputs import Picture
 from vibench.plugins.plugin import Plugin
 from vibench.results import pictures
@@ -59,50 +58,29 @@ def test_solutions_at_corners_and_middle_are_read(drawn: tuple[tuple[str, Pictur
     assert list(pictures.read(tmp_path / FILE)) == [Shown(("membrane", OBSTACLE.options), "", None, "the camera broke")]
 
 
-class Drawing(Wire):
-    """A wire that draws itself on a line, one array of the wrong shape."""
-
-    wrong = ""
-    kind: type = float
-    name: object = "u [m]"
-
-    def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
-        x = np.linspace(0.0, 1.0, self.V.dim)[None]
-        arrays = {"points": x, "values": u, "positions": x, "multiplier": lam, "triangles": np.zeros((3, 0), int)}
-        if self.wrong:
-            arrays[self.wrong] = np.zeros((3, 4))
-        arrays["values"] = arrays["values"].astype(self.kind)
-        return Picture(**arrays, name=self.name, multiplier_name="λ [N]")  # type: ignore[arg-type]
+LINE = Picture(np.arange(4.0)[None], np.zeros((3, 0), int), np.ones(4), "u", np.ones((1, 4)), np.ones(4), "λ [N]")
+WRONG = (
+    ({"points": np.zeros((3, 4))}, "points of Picture has 3 rows, expected 1 or 2"),
+    ({"positions": np.zeros((3, 4))}, "positions of Picture has 3 rows, expected 1 or 2"),
+    ({"values": np.zeros((3, 4))}, "values of Picture has the shape (3, 4)"),
+    ({"values": np.zeros(3)}, "points of Picture has p = 4, but that of values is 3"),
+    ({"values": np.ones(4, complex)}, "values of Picture is array([1.+0.j"),
+    ({"multiplier": np.zeros(3)}, "positions of Picture has m = 4, but that of multiplier is 3"),
+    ({"triangles": np.zeros((2, 1), int)}, "triangles of Picture has 2 rows, expected 3"),
+    ({"triangles": np.array([[0], [1], [4]])}, "triangles of Picture refers to points 0 to 4; there are 4"),
+    ({"name": b"u"}, "name of Picture is b'u', expected a text"),
+)
 
 
-Draws = Callable[..., tuple[tuple[str, Picture], ...]]
-
-
-@pytest.fixture
-def draws(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Draws:
-    """Function that gives the pictures of a wire which draws itself as asked for."""
-    wire = Plugin("problem", "wire", "{}", "test")
-    for module in ("vibench.stages.pictures", "vibench.stages.snapshots"):
-        monkeypatch.setattr(f"{module}.build_problem", lambda _: Drawing())
-    store = SampleStore(tmp_path)
-    carry_out(PictureStage(wire), store)
-
-    def draw(**how: object) -> tuple[tuple[str, Picture], ...]:
-        for name, value in how.items():
-            monkeypatch.setattr(Drawing, name, value)
-        return tuple(PictureStage(wire).run(store).value)
-
-    return draw
-
-
-def test_arrays_and_names_of_the_wrong_sort_are_named_and_names_are_one_printable_line(draws: Draws) -> None:
-    assert {picture.name for _, picture in draws(name="u\n\x1b[2J\ud800")} == {r"u \u001b[2J\ud800"}
-    for wrong in ("points", "values", "positions", "multiplier"):
-        with pytest.raises(NumericalError, match=f"picture has .*{wrong}.* of the wrong shape"):
-            draws(wrong=wrong, name="u [m]")
-    for kind in (str, complex, object):
-        with pytest.raises(NumericalError, match="picture has values of the wrong type"):
-            draws(kind=kind, wrong="")
-    for name in (None, 3, b"u"):
-        with pytest.raises(NumericalError, match="picture has name of the wrong type"):
-            draws(name=name, kind=float)
+def test_arrays_and_names_of_the_wrong_sort_are_named(tmp_path: Path) -> None:
+    for wrong, words in WRONG:
+        with pytest.raises(RequestError, match=re.escape(words)):
+            replace(LINE, **wrong)
+    # Beyond the numbers of single precision.
+    with np.errstate(over="ignore"):
+        (row,) = pictures.picture_rows([("", replace(LINE, values=1e39 * LINE.values))])
+    journal = ResultsDatabase(tmp_path, {"name": "some"})
+    journal.replace("pictures", [KEYS | row])
+    journal.close()
+    (shown,) = pictures.read(tmp_path / FILE)
+    assert (shown.picture, shown.reason) == (None, "values of Picture has an entry that is not finite, first at [0]")

@@ -156,7 +156,7 @@ def test_the_layers_are_those_of_the_import_contract_in_its_order() -> None:
     assert layers == sorted(layers, key=order.index)
     assert set(order) - set(layers) == {
         "cli", "benchmarks", "testing", "library", "report", "execution", "results", "study", "plugins",
-        "provenance", "files", "interrupts", "signatures", "errors", "text", "guardian",
+        "provenance", "files", "interrupts", "signatures", "errors", "text", "guardian", "process",
     }  # fmt: skip
     assert [layer for layer in provenance.LAYERS if not [*CORE.glob(f"{layer.replace('.', '/')}*")]] == []
 
