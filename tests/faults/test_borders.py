@@ -9,33 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from fake_plugins import Wire
-from hostile import (
-    ANYWHERE,
-    CHANGED,
-    DUAL,
-    PHASES,
-    PRIMAL,
-    PROBLEM,
-    Honest,
-    HonestCone,
-    HonestNearest,
-    HonestSpace,
-    Hostile,
-    HostileCone,
-    HostileSampling,
-    HostileSpace,
-    HostileWire,
-)  # fmt: skip
+from hostile import ANYWHERE, CHANGED, KINDS, Honest, HonestCone, HonestNearest, HonestSpace, HostileSampling
 from running import MEASURED
 
 from vibench import RequestError, Run, Study, run
 
 FEW = {"solvers": ["piqp"], "dual": ["cpg"], "primal": ["decorrelated"], "tolerances": [{"pod": [0.1], "dual": [0.1]}]}
 
-KINDS = {
-    "formulation": (Hostile, PHASES), "dual": (HostileCone, DUAL), "primal": (HostileSpace, PRIMAL),
-    "problem": (HostileWire, PROBLEM),
-}  # fmt: skip
 EXPECTED = {
     kind: {f"{phase}-{how}": said for phase, acts in phases.items() for how, (said, _) in acts.items()}
     for kind, (_, phases) in KINDS.items()
@@ -58,11 +38,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
         )  # fmt: skip
         found[kind] = run(study, tmp_path_factory.mktemp("borders"), jobs=1, fresh=True, progress=False)
     return found
-
-
-@pytest.fixture(scope="module")
-def cells(runs: dict[str, Run]) -> pd.DataFrame:
-    return runs["formulation"].table("cells").set_index("formulation")
 
 
 def honest(found: Run, table: str, formulations: list[str]) -> pd.DataFrame:
@@ -103,12 +78,10 @@ def test_what_a_sampling_does_to_the_process_of_the_command_is_undone() -> None:
             assert before == (sys.path, np.geterr(), signal.getsignal(signal.SIGTERM), os.environ), how
 
 
-def test_a_buffer_that_is_filled_again_is_judged_by_what_it_held(cells: pd.DataFrame) -> None:
+def test_buffers_are_judged_by_what_they_held_and_work_in_reconstruct_is_of_the_query(runs: dict[str, Run]) -> None:
+    cells = runs["formulation"].table("cells").set_index("formulation")
     for name in ("error_u_mean", "error_lambda_mean"):
         assert cells.loc["pair-buffer", name] == cells.loc["Honest", name]
-
-
-def test_work_in_reconstruct_is_a_part_of_the_query(cells: pd.DataFrame) -> None:
     cheat, fair = cells.loc["reconstruct-solves"], cells.loc["Honest"]
     assert cheat["error_u_mean"] < 1e-10
     assert cheat["online_solve_s"] > cheat["online_reconstruct_s"] > 0.0

@@ -73,9 +73,6 @@ Raises = _changed("Raises", lambda vi: throw(ArithmeticError("the wire\nsnapped"
 Sleeps = _changed("Sleeps", lambda vi: time.sleep(3600))
 Exits = _changed("Exits", lambda vi: os._exit(3))
 Segfaults = _changed("Segfaults", lambda vi: segfault())
-NotANumber = _changed("NotANumber", lambda vi: replace(vi, f=vi.f * np.nan))
-WrongShape = _changed("WrongShape", lambda vi: replace(vi, g=vi.g[:-1]))
-Indefinite = _changed("Indefinite", lambda vi: replace(vi, A=-vi.A))
 
 
 class Broken(Wire):
@@ -94,12 +91,6 @@ Infeasible = _changed(
 )
 
 
-class CrookedSpace(Wire):
-    def __init__(self) -> None:
-        super().__init__()
-        self.V = InnerProduct(self.stiffness - 1e3 * self.mass, "X_V")
-
-
 class Chatty(Wire):
     """Prints, writes past Python, forks, and is right all the same."""
 
@@ -116,36 +107,11 @@ class Chatty(Wire):
 
 
 class BadCone(DualStrategy):
-    def __init__(self, how: Literal["nan", "shape", "negative", "long", "nothing"]) -> None:
+    def __init__(self, how: Literal["negative"]) -> None:
         self.how = how
 
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        chi = snapshots[:, :2] / W.norm(snapshots[:, :2])
-        broken = {"nan": chi * np.nan, "shape": chi[1:], "negative": -chi, "long": 2.0 * chi, "nothing": None}[self.how]
-        if broken is None:
-            return None  # type: ignore[return-value]
-        return Cone(broken, np.ones(1), np.zeros(2, dtype=bool))
-
-
-class BadVectors(PrimalStrategy):
-    def __init__(self, how: Literal["nan", "shape", "long", "supply", "nothing", "writes"]) -> None:
-        self.how = how
-
-    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
-        if self.how == "supply":
-            return Enrichment(Kind.PER_PARAMETER, supply=flat_supply)
-        if self.how == "nothing":
-            return None  # type: ignore[return-value]
-        if self.how == "writes":
-            assert not any(given.flags.writeable for given in (offline.cone.generators, offline.span))
-            offline.basis[:] = 0.0  # which others are given, too
-        one = offline.problem.V.orthonormalise(np.ones((offline.problem.V.dim, 1)), offline.basis)
-        broken = {"nan": one * np.nan, "shape": one[1:], "long": 2.0 * one}[self.how]
-        return Enrichment(Kind.FIXED, vectors=broken)
-
-
-def flat_supply(V: InnerProduct, vi: VariationalInequality, span: Array) -> Array:
-    return np.ones(V.dim)
+        return Cone(-snapshots[:, :2] / W.norm(snapshots[:, :2]), np.ones(1), np.zeros(2, dtype=bool))
 
 
 def _reducing(name: str, act: Callable[[], Any], **members: Any) -> type[DualStrategy]:
@@ -168,11 +134,6 @@ class WaitingCone(DualStrategy):
         while not self.file.exists():
             time.sleep(0.05)
         return greedy_cone(snapshots, W, stop)
-
-
-class RaisingEnrichment(PrimalStrategy):
-    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
-        raise LookupError("no vector found")
 
 
 class CountingEnrichment(PrimalStrategy):

@@ -1,4 +1,4 @@
-"""Plugins that do all they can to their process and their neighbours, and two honest formulations of their package."""
+"""Plugins that do all they can to their process and their neighbours, and honest ones of their package."""
 
 import locale
 import os
@@ -11,33 +11,16 @@ import warnings
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any, ClassVar
 
 import numpy as np
+from broken_strategies import Greedy
 from fake_plugins import Wire
 from formulations import Nearest, Program, ProgramModel
 
-from vibench import (
-    Array,
-    Cone,
-    DualStrategy,
-    Enrichment,
-    FormulationAnswer,
-    FormulationModel,
-    HighFidelitySolver,
-    InnerProduct,
-    Kind,
-    Offline,
-    OfflinePhase,
-    ParameterBox,
-    PrimalStrategy,
-    QuerySettings,
-    Sampling,
-    Stop,
-    VariationalInequality,
-    greedy_cone,
-    supremizers,
-)  # fmt: skip
+import vibench
+from vibench import Array, Enrichment, FormulationAnswer, InnerProduct, Kind, Offline, VariationalInequality
 
 Acts = Mapping[str, tuple[str, Callable[[Any], Any]]]
 """What is done, by its name, and what its cell says of it: the status and words of the reason."""
@@ -67,6 +50,11 @@ def double(matrix: Any) -> None:
 
 def replaced(owner: Any, name: str) -> None:
     setattr(owner, name, copy(getattr(owner, name)))
+
+
+def changed(name: str, change: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A function that returns another one with a changed member."""
+    return lambda one: replace(one, **{name: change(getattr(one, name))})
 
 
 def vi(owner: Any) -> Any:
@@ -105,10 +93,7 @@ BUILD: Acts = {
     "cone": ("error: read-only", lambda offline: fill(offline.cone.generators)),
     "span": ("error: read-only", lambda offline: fill(offline.multipliers.span)),
     "snapshots": ("ok: ", lambda offline: fill(offline.snapshots.u)),
-    "training": (
-        "error: Wire' is another one since: training_set",
-        lambda o: setattr(o.problem, "training_set", throw),
-    ),
+    "training": ("error: another one since: training_set", lambda o: setattr(o.problem, "training_set", throw)),
 }
 MODEL: Acts = {
     "true": ("error: `dimension` of the model is True", lambda made: setattr(made, "dimension", True)),
@@ -116,11 +101,12 @@ MODEL: Acts = {
     "less": ("error: `enrichment` of the model is -5", lambda made: setattr(made, "enrichment", -5)),
     "more": ("error: `enrichment` of the model is 99, more", lambda made: setattr(made, "enrichment", 99)),
 }
+TRIVIAL = VariationalInequality(np.eye(1), np.zeros(1), np.zeros((1, 1)), np.zeros(1))
 SOLVE: Acts = {
     "mu": ("error: read-only", lambda model: fill(model.mu)),
     "A": (CHANGED, lambda model: double(vi(model).A)),
     "slow": ("timeout: query_seconds = 1 s", hang),
-    "trivial": ("inaccurate: its last quadratic program: its solution is not the answer", lambda model: None),
+    "trivial": ("inaccurate: its solution is not the answer", lambda one: one.settings.solve_qp(TRIVIAL)),
 }
 ANSWER: Acts = {
     "tuple": ("error: `solve` returned a tuple", lambda one: (one.x, one.alpha)),
@@ -146,15 +132,13 @@ PAIR: Acts = {
     "far": ("nonfinite: u or λ is not finite", lambda pair: (1e200 * pair[0], pair[1])),
     "unreal": ("error: u of `reconstruct` is complex", lambda pair: (pair[0] + 0j, pair[1])),
     "force": ("nonfinite: u or λ is not finite", lambda pair: (pair[0], np.inf * pair[1])),
-    "buffer": ("ok: ", lambda pair: (np.copyto(BUFFER, pair[0]), (BUFFER, pair[1]))[1]),
+    "buffer": ("ok: ", lambda pair: (kept(pair[0][:, None])[:, 0], pair[1])),
 }
 RECONSTRUCT: Acts = {
     "mu": ("error: read-only", lambda model: fill(model.mu)),
     "A": (CHANGED, lambda model: double(vi(model).A)),
-    "solves": ("ok: ", lambda model: None),
+    "solves": ("ok: ", lambda model: attrgetter("u", "lam")(vibench.HighFidelitySolver(model.problem).solve(model.mu))),
 }
-BUFFER = np.zeros(12)
-ENDS = {how: ANYWHERE[how] for how in ("raises", "leaves", "exits")}
 REDUCE: Acts = {
     "snapshots": ("ok: ", lambda given: fill(given[0])),
     "W": ("error: read-only", lambda given: double(given[1].matrix)),
@@ -164,6 +148,11 @@ REDUCE: Acts = {
     "stop": ("ok: ", lambda given: object.__setattr__(given[2], "tolerance", 1.0)),
 }
 CONE: Acts = {
+    "nan": ("error: generators of Cone has an entry that is", changed("generators", lambda chi: chi * np.nan)),
+    "short": ("error: `generators` of the cone has shape (11, ", changed("generators", lambda chi: chi[1:])),
+    "negative": ("error: a generator has the negative coefficient -", changed("generators", np.negative)),
+    "long": ("error: the generators do not all have unit norm in W", changed("generators", lambda chi: 2.0 * chi)),
+    "nothing": ("error: the dual strategy returned a NoneType, expected a Cone", lambda _: None),
     "buffer": ("ok: ", lambda cone: replace(cone, generators=kept(cone.generators))),
     "forged": ("error: `errors` of the cone has the type", lambda cone: forged(cone, "errors", None)),
     "words": ("error: raised TypeError: 'int'", lambda cone: forged(cone, "fallbacks", 5)),
@@ -174,31 +163,21 @@ ENRICH: Acts = {
     "span": ("error: read-only", lambda offline: fill(offline.span)),
     "training": ("error: read-only", lambda offline: fill(offline.training)),
     "phase": ("ok: ", lambda offline: object.__setattr__(offline, "basis", offline.basis[:, :1])),
-    "V": (
-        "error: V._solver is replaced",
-        lambda offline: setattr(offline.problem.V, "_solver", copy(offline.problem.V._solver)),
-    ),
+    "V": ("error: V._solver is replaced", lambda offline: replaced(offline.problem.V, "_solver")),
     "spaces": ("error: read-only", lambda offline: fill(offline.problem.V._factor._root)),
 }
 VECTORS: Acts = {
+    "nan": ("error: vectors of Enrichment has an entry that is not finite", changed("vectors", lambda Z: Z * np.nan)),
+    "short": ("error: `vectors` of the enrichment has shape (11, ", changed("vectors", lambda Z: Z[1:])),
+    "long": ("error: the vectors of the enrichment are not orthonormal in V", changed("vectors", lambda Z: 2.0 * Z)),
+    "nothing": ("error: the primal strategy returned a NoneType, expected an Enrichment", lambda _: None),
+    "flat": ("error: has shape (12,), expected (12, count)", lambda _: Enrichment(Kind.PER_PARAMETER, supply=flat)),
     "buffer": ("ok: ", lambda one: replace(one, vectors=kept(one.vectors))),
-    "history": ("error: history of Enrichment is {'x': nan}", lambda one: replace(one, history={"x": np.nan})),
+    "history": ("error: history of Enrichment is {'x': array(['", changed("history", lambda _: {"x": np.array(["y"])})),
     "supply": (CHANGED, lambda one: Enrichment(Kind.PER_PARAMETER, supply=doubling)),
 }
 PARAMETERS: Acts = {"box": ("error: read-only", lambda given: fill(given.parameters.lower))}
 ASSEMBLE: Acts = {"mu": ("error: read-only", fill)}
-
-PHASES = {
-    "build": BUILD | ANYWHERE, "model": MODEL, "solve": SOLVE | ENDS, "answer": ANSWER, "pair": PAIR,
-    "reconstruct": RECONSTRUCT | {how: ANYWHERE[how] for how in ("raises", "exits")},
-}  # fmt: skip
-DUAL = {"reduce": REDUCE | {how: ANYWHERE[how] for how in ("path", "thread", "alarm", "exits", "leaves")}, "cone": CONE}
-PRIMAL = {"enrich": ENRICH | {how: ANYWHERE[how] for how in ("signals", "random", "exits")}, "vectors": VECTORS}
-PROBLEM = {
-    "init": {how: ANYWHERE[how] for how in ("folder", "leaves")},
-    "parameters": PARAMETERS | ENDS, "assemble": ASSEMBLE | {how: ANYWHERE[how] for how in ("errors", "exits")},
-}  # fmt: skip
-ACTS = PHASES | DUAL | PRIMAL | PROBLEM
 
 
 def kept(array: Array) -> Array:
@@ -220,107 +199,115 @@ def doubling(V: InnerProduct, vi: VariationalInequality, span: Array) -> Array:
     return np.ones((V.dim, 1))
 
 
-class HonestCone(DualStrategy):
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        return greedy_cone(snapshots, W, stop)
+def flat(V: InnerProduct, vi: VariationalInequality, span: Array) -> Array:
+    return np.ones(V.dim)
 
 
-class HonestSpace(PrimalStrategy):
+class HonestCone(Greedy):
+    pass
+
+
+class HonestSpace(vibench.PrimalStrategy):
     def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
         V, B = offline.problem.V, offline.problem.constraint(offline.training[0])[0]
-        return Enrichment(Kind.FIXED, vectors=V.orthonormalise(supremizers(V, B, offline.span), offline.basis))
+        return Enrichment(Kind.FIXED, vectors=V.orthonormalise(vibench.supremizers(V, B, offline.span), offline.basis))
 
 
-class HostileCone(HonestCone):
+class Acting:
+    """It does what its option says, in a phase, by the tables above."""
+
     def __init__(self, how: str) -> None:
         self.how = how
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def act(self, phase: str, given: Any, otherwise: Any = None) -> Any:
+        own, name = self.how.split("-")
+        phases = {one: acts for _, of_kind in KINDS.values() for one, acts in of_kind.items()}
+        return phases[phase][name][1](given) if own == phase else otherwise
+
+
+class HostileCone(Acting, HonestCone):
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: vibench.Stop) -> vibench.Cone:
         cone = super().reduce(snapshots, W, stop)
-        act(self.how, "reduce", (snapshots, W, stop))
-        return act(self.how, "cone", cone, cone)
+        self.act("reduce", (snapshots, W, stop))
+        return self.act("cone", cone, cone)
 
 
-class HostileSpace(HonestSpace):
-    def __init__(self, how: str) -> None:
-        self.how = how
-
+class HostileSpace(Acting, HonestSpace):
     def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
         enrichment = super().build(offline, tolerance)
-        act(self.how, "enrich", offline)
-        return act(self.how, "vectors", enrichment, enrichment)
+        self.act("enrich", offline)
+        return self.act("vectors", enrichment, enrichment)
 
 
-class HostileWire(Wire):
+class HostileWire(Acting, Wire):
     def __init__(self, how: str) -> None:
-        self.how = how
-        act(how, "init", self)
-        super().__init__()
+        super().__init__(how)
+        self.act("init", self)
+        Wire.__init__(self)
 
     def training_set(self) -> Array:
-        act(self.how, "parameters", self)
+        self.act("parameters", self)
         return super().training_set()
 
     def assemble(self, mu: Array) -> VariationalInequality:
-        act(self.how, "assemble", mu)
+        self.act("assemble", mu)
         return super().assemble(mu)
 
 
-class HostileSampling(Sampling):
+class HostileSampling(Acting, vibench.Sampling):
     """It chooses parameters in the process of the command, too, which refuses what raises."""
 
-    def __init__(self, how: str) -> None:
-        self.how = how
-
-    def parameters(self, box: ParameterBox) -> Array:
-        act(self.how, "build", box)
+    def parameters(self, box: vibench.ParameterBox) -> Array:
+        self.act("build", box)
         return box.grid(5)
 
 
-class Hostile(Program):
-    """It does what its option says, in a phase, by the tables above."""
-
+class Hostile(Acting, Program):
     uses: ClassVar[tuple[str, ...]] = ("pod", "dual", "primal", "solvers", "accuracy")
 
-    def __init__(self, how: str) -> None:
-        self.how = how
+    def build(self, offline: vibench.OfflinePhase) -> Mapping[str, Any]:
+        self.act("build", offline)
+        return {}
 
-    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
-        return act(self.how, "build", offline, {})
-
-    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
+    def model(self, offline: vibench.OfflinePhase, built: Mapping[str, Any]) -> vibench.FormulationModel:
         made = HostileModel(offline)
         made.how, made.problem = self.how, offline.problem
-        act(self.how, "model", made)
+        self.act("model", made)
         return made
 
 
-def act(how: str, phase: str, given: Any, otherwise: Any = None) -> Any:
-    own, name = how.split("-")
-    if own != phase:
-        return otherwise
-    done = ACTS[phase][name][1](given)
-    return otherwise if phase == "build" else done
+class HostileModel(ProgramModel, Acting):
+    mu = problem = settings = None
 
-
-class HostileModel(ProgramModel):
-    how = ""
-    mu = problem = None
-
-    def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
-        self.mu = mu
-        act(self.how, "solve", self)
+    def solve(self, mu: Array, settings: vibench.QuerySettings) -> FormulationAnswer:
+        self.mu, self.settings = mu, settings
         answer = super().solve(mu, settings)
-        if self.how == "solve-trivial":
-            zeros = np.zeros((1, 1)), np.zeros(1)
-            settings.solve_qp(VariationalInequality(np.eye(1), zeros[1], zeros[0], zeros[1]))
-        return act(self.how, "answer", answer, answer)
+        self.act("solve", self)
+        return self.act("answer", answer, answer)
 
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> Any:
         self.mu = mu
-        if self.how == "reconstruct-solves":
-            found = HighFidelitySolver(self.problem).solve(mu)
-            return found.u, found.lam
-        act(self.how, "reconstruct", self)
-        pair = super().reconstruct(mu, answer)
-        return act(self.how, "pair", pair, pair)
+        pair = self.act("reconstruct", self) or super().reconstruct(mu, answer)
+        return self.act("pair", pair, pair)
+
+
+def anywhere(*names: str) -> Acts:
+    return {name: ANYWHERE[name] for name in names}
+
+
+KINDS: Mapping[str, tuple[type, Mapping[str, Acts]]] = {
+    "formulation": (Hostile, {
+        "build": BUILD | ANYWHERE, "model": MODEL, "solve": SOLVE | anywhere("raises", "leaves", "exits"),
+        "answer": ANSWER, "pair": PAIR, "reconstruct": RECONSTRUCT | anywhere("raises", "exits"),
+    }),
+    "dual": (HostileCone, {
+        "reduce": REDUCE | anywhere("path", "thread", "alarm", "exits", "leaves", "raises"), "cone": CONE,
+    }),
+    "primal": (HostileSpace, {
+        "enrich": ENRICH | anywhere("signals", "random", "exits", "raises"), "vectors": VECTORS,
+    }),
+    "problem": (HostileWire, {
+        "init": anywhere("folder", "leaves"), "parameters": PARAMETERS | anywhere("raises", "leaves", "exits"),
+        "assemble": ASSEMBLE | anywhere("errors", "exits"),
+    }),
+}  # fmt: skip

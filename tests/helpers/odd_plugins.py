@@ -49,13 +49,6 @@ class OddEnrichment(PrimalStrategy):
         return Enrichment(Kind.NONE, history={ODD: history}, fallbacks=(ODD, 100_000 * ODD))
 
 
-class WordyEnrichment(PrimalStrategy):
-    """Adds nothing, and reports words in place of numbers."""
-
-    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
-        return Enrichment(Kind.NONE, history={"steps": np.array(["many"])})
-
-
 def counts_far(program: VariationalInequality, accuracy: float) -> QPSolution:
     found = careful(program, accuracy)
     return QPSolution(found.x, found.alpha, ODD, 2**80)

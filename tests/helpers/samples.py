@@ -117,18 +117,14 @@ def query_rows(cell: str = "c1", count: int = 2, **columns: Any) -> list[dict[st
 
 FAKES: Mapping[str, Mapping[str, str]] = {
     "vibench.problems": {
-        "wire": "Wire", "wire-raises": "Raises", "wire-nan": "NotANumber", "wire-shape": "WrongShape",
-        "wire-indefinite": "Indefinite", "wire-broken": "Broken", "wire-hungry": "Hungry", "wire-sleeps": "Sleeps",
-        "wire-exits": "Exits", "wire-segfaults": "Segfaults", "wire-infeasible": "Infeasible",
-        "wire-crooked": "CrookedSpace", "wire-chatty": "Chatty",
+        "wire": "Wire", "wire-raises": "Raises", "wire-broken": "Broken", "wire-hungry": "Hungry",
+        "wire-sleeps": "Sleeps", "wire-exits": "Exits", "wire-segfaults": "Segfaults", "wire-infeasible": "Infeasible",
+        "wire-chatty": "Chatty",
     },
     "vibench.dual_strategies": {
-        "cone-needs": "NeedyCone", "cone-raises": "RaisingCone", "cone-waits": "WaitingCone", "cone-bad": "BadCone",
+        "cone-needs": "NeedyCone", "cone-raises": "RaisingCone", "cone-waits": "WaitingCone",
     },
-    "vibench.primal_strategies": {
-        "enrichment-raises": "RaisingEnrichment", "enrichment-counts": "CountingEnrichment",
-        "enrichment-bad": "BadVectors",
-    },
+    "vibench.primal_strategies": {"enrichment-counts": "CountingEnrichment"},
     "vibench.qp_solvers": {"nan": "not_a_number", "counts": "numpy_count"} | {name.replace("_", "-"): name for name in (
         "careful", "raises", "nothing", "gives_up", "wrong", "wrong_length", "dies", "leaves", "hangs", "segfaults",
         "dies_sometimes", "dies_once", "hungry", "chatty",

@@ -32,6 +32,7 @@ REASONS: Mapping[str, str] = {
     "ConstantConstraint": "a member declared `constant` depends on mu: row",
     "SingularDualNorm": "the Gram matrix",
     "NoisyLoad": "two assemblies at one parameter are not the same, as in another process: row",
+    "NotANumberInACorner": "g has entries that are not finite at mu = [",
     "LoadOnAllNodes": "f has shape (49,) at mu = [1.0]; the spaces V and W require (25,)",
     "ComplexStiffness": "at mu = [0.25, 0.05]: A is complex",
     "DependsOnTheCallBefore": "two assemblies at one parameter are not the same",
