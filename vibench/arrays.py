@@ -87,7 +87,10 @@ def is_sound(array: Array | None) -> bool:
 
 
 def read_only(array: A) -> A:
-    """A view of an array into which nobody writes by chance."""
+    """An array that is read-only, or a view of it into which nobody writes by chance."""
+    # What shares an array is stored with one.
+    if not array.flags.writeable:
+        return array
     view = array.view()
     view.flags.writeable = False
     return view
