@@ -197,7 +197,7 @@ def test_pipes_of_others_are_refused_wherever_a_file_is_opened(run: Path) -> Non
 
 
 def test_only_figures_of_vibench_are_removed(tmp_path: Path) -> None:
-    ours, theirs = ["obstacle-convergence.png", "hertz-mcpg-inf-sup.svg"], ["my-own.svg", "errors.txt", "errors.png"]
+    ours, theirs = ["obstacle-convergence.png", "hertz-bounds.svg"], ["my-own.svg", "errors.txt", "errors.png"]
     for name in (*ours, *theirs):
         (tmp_path / name).touch()
     figures.remove(tmp_path)
