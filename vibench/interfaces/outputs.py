@@ -151,13 +151,7 @@ class MeshFields:
                 yield from _real_faults(f"in_cells[{owner!r}][{name!r}]", values, (len(self.cells[owner]),))
 
     def _cell_faults(self, name: str, corners: Indices) -> Iterator[str]:
-        where = f"cells[{name!r}]"
-        # Numbers of nodes by meshio's names of the types; the corners come first, as in VTK.
-        nodes = {
-            "vertex": 1, "line": 2, "triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8,
-            "line3": 3, "triangle6": 6, "quad8": 8, "quad9": 9, "tetra10": 10, "pyramid13": 13, "wedge15": 15,
-            "hexahedron20": 20, "hexahedron27": 27,
-        }  # fmt: skip
+        where, nodes = f"cells[{name!r}]", _node_counts()
         if name not in nodes:
             yield f"{where}: no type of cells; expected one of {', '.join(nodes)}"
         elif not np.issubdtype(corners.dtype, np.integer) or corners.ndim != 2 or corners.shape[1] != nodes[name]:
@@ -196,6 +190,17 @@ class MeshFields:
         at_points = {picture.name: np.concatenate([values, np.full(len(vertices), np.nan)])}
         in_cells = {"vertex": {picture.multiplier_name: picture.multiplier}}
         return cls(points, cells | {"vertex": vertices}, at_points, in_cells)
+
+
+def _node_counts() -> dict[str, int]:
+    """Numbers of nodes of the types of cells, by meshio's names; the corners come first, as in VTK."""
+    linear = ("vertex", "line", "triangle", "quad", "tetra", "pyramid", "wedge", "hexahedron")
+    counts = dict(zip(linear, (1, 2, 3, 4, 4, 5, 6, 8), strict=True))
+    # Types of higher order have their number of nodes at the end of their names.
+    higher = (
+        "line3", "triangle6", "quad8", "quad9", "tetra10", "pyramid13", "wedge15", "hexahedron20", "hexahedron27",
+    )  # fmt: skip
+    return counts | {name: int(name.lstrip("abcdefghijklmnopqrstuvwxyz")) for name in higher}
 
 
 def _real_faults(name: str, values: Any, *shapes: tuple[int, ...], missing: bool = True) -> Iterator[str]:

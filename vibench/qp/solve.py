@@ -30,8 +30,6 @@ from vibench.text import one_line
 
 T = TypeVar("T")
 
-FREE = "nothing to solve: no constraint acts"
-
 
 def _piqp(program: VariationalInequality, bounds: bool = False, **settings: Any) -> QPSolution:
     import piqp  # noqa: PLC0415  an optional solver
@@ -82,7 +80,7 @@ def solve_qp(
     if not len(program.g):
         return _unconstrained(program, factor)
     if not program.f.any() and (program.g >= 0.0).all():
-        return QPSolution(np.zeros_like(program.f), np.zeros_like(program.g), FREE)
+        return _free(np.zeros_like(program.f), program)
     found = _solve_shifted(program, solver, accuracy, extra, factor, start)
     if found is not None:
         return found
@@ -210,7 +208,7 @@ def _solve_dual(
     constraints, load = _whitened(program, factor, rows[:, None])
     A, f = constraints @ constraints.T, constraints @ load - program.g / rows
     if not (f > 0.0).any():
-        return QPSolution(_solve_factor(factor, load.copy(), transposed=True), np.zeros(len(f)), FREE)
+        return _free(_solve_factor(factor, load.copy(), transposed=True), program)
     dual = VariationalInequality(A, f, B=-np.eye(len(f)), g=np.zeros(len(f)))
     if start is not None and start.alpha is not None and start.x is not None:
         # The multipliers of the constraints −α ≤ 0 are the slacks g − Bx.
@@ -242,7 +240,7 @@ def _least_distance(
     K, load = _whitened(program, factor, 1.0)
     depths = K @ load - program.g
     if (deepest := float((depths / row_norms(K)).max())) <= 0.0:
-        return QPSolution(_solve_factor(factor, load.copy(), transposed=True), np.zeros(len(K)), FREE)
+        return _free(_solve_factor(factor, load.copy(), transposed=True), program)
     begun = None if start is None else start.alpha
     active = np.zeros(len(K), np.int32) if begun is None else (begun > 0.0).astype(np.int32)
     # DAQP takes no matrix for the identity, and 1e30 for no bound on this side.
@@ -268,6 +266,11 @@ def _whitened(program: VariationalInequality, L: Array, rows: Array | float) -> 
     right[-1] = program.f
     whitened = _solve_factor(L, right.T).T
     return whitened[:-1], whitened[-1]
+
+
+def _free(x: Array, program: VariationalInequality) -> QPSolution:
+    """The solution x (n,) of a program, which presses on no constraint."""
+    return QPSolution(x, np.zeros_like(program.g), "nothing to solve: no constraint acts")
 
 
 def _solve_factor(L: Array, right: Array, *, transposed: bool = False) -> Array:

@@ -42,7 +42,7 @@ class Look:
 
     colour: str
     marker: str
-    rank: int = 0
+    rank: int
     dashes: Any = "-"
 
     def line(self, count: int) -> dict[str, Any]:
@@ -61,7 +61,7 @@ class Look:
                 "markeredgewidth": edge}  # fmt: skip
 
 
-HIGH_FIDELITY_LOOK = Look("#000000", "s")
+HIGH_FIDELITY_LOOK = Look("#000000", "s", 0)
 
 
 class Series(NamedTuple):
@@ -78,7 +78,7 @@ def look_of(name: str) -> Look:
     # and of the solvers look the same.
     salt = (120727).to_bytes(8, "big")
     number = int.from_bytes(hashlib.blake2b(name.encode(errors="replace"), digest_size=8, salt=salt).digest(), "big")
-    return Look(COLOURS[number % len(COLOURS)], MARKERS[number // len(COLOURS) % len(MARKERS)])
+    return Look(COLOURS[number % len(COLOURS)], MARKERS[number // len(COLOURS) % len(MARKERS)], 0)
 
 
 def _looks_of(names: Iterable[str]) -> dict[str, Look]:
@@ -95,7 +95,7 @@ def _looks_of(names: Iterable[str]) -> dict[str, Look]:
             free = [colour for colour in COLOURS if colour not in {colour for colour, _ in taken}]
             rest = (pair for pair in product(COLOURS, MARKERS) if pair not in taken)
             colour, marker = (free[0], look.marker) if free else next(rest, (look.colour, look.marker))
-            looks[name] = Look(colour, marker)
+            looks[name] = Look(colour, marker, 0)
     return looks
 
 
@@ -332,8 +332,9 @@ def _label_ends(axes: Axes) -> None:
         highest = 1.0 if k == len(ends) - 1 else places[k + 1] - 0.5 * (room[k] + room[k + 1])
         places[k] = min(places[k], highest)
     for place, (_, lines, line) in zip(places, ends, strict=True):
-        looks: dict[str, Any] = {"color": line.get_color(), "marker": line.get_marker(), "markersize": 3.5}
-        axes.plot(1.05, place, transform=axes.transAxes, clip_on=False, mfc=line.get_markerfacecolor(), **looks)
+        # Typing knows no marker of a line that a plot would not take.
+        look: dict[str, Any] = {"color": line.get_color(), "marker": line.get_marker()}
+        axes.plot(1.05, place, transform=axes.transAxes, clip_on=False, ms=3.5, mfc=line.get_markerfacecolor(), **look)
         axes.text(1.09, place, "\n".join(lines), transform=axes.transAxes, fontsize=7.5, va="center_baseline")
 
 
