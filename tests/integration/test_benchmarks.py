@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from forking import run_command
 from outputs import clean
-from running import Main, Register, refused, succeeded
+from running import Main, Register, refused
 from samples import install_fakes
 
 from vibench import RequestError, benchmarks
@@ -288,10 +288,12 @@ def test_a_row_has_the_figure_that_changed_most_and_what_differs_is_said(tmp_pat
     assert {"2", "3", "1.5", "gap", "1e-12", "4e-09", "less"} <= set(out.split())
     before = written(tmp_path / "before.json", entry("a", 1.0, SAME), entry("b", 1.0, SAME))
     after = written(tmp_path / "after.json", entry("b", 1.0, SAME), entry("c", 1.0, SAME), machine="two cores")
-    out = succeeded(main("bench", "--read", after, "--against", before))
+    code, out, _ = main("bench", "--read", after, "--against", before)
+    assert code == 0
     assert {"new: c", "gone: a", "machine before: one core", "machine after:  two cores"} <= set(out.splitlines())
     other = written(tmp_path / "other.json", entry("d", 1.0, SAME))
-    out = succeeded(main("bench", "--read", after, "--against", other))
+    code, out, _ = main("bench", "--read", after, "--against", other)
+    assert code == 0
     assert "0 benchmarks in both files; 0 worse" in out
 
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numerics import Varying
 
 from vibench import Array, Cone, HighFidelitySolver, Kind, NumericalError, Offline, Stop, check_enrichment, no_free
+from vibench.errors import RequestError
 from vibench.linalg.inner_product import orthonormal_range, project_out, singular_values
 from vibench.reduction.cones import LazyMaximum
 from vibench.reduction.nested import NestedStrategy, grow_through
@@ -300,7 +301,7 @@ def test_the_unreachable_has_a_reason_and_pga_needs_a_tolerance(varying: Offline
         reason = rf"tolerance {tolerance:g} is not reached: with all supremizers added, {measure}"
         with pytest.raises(NumericalError, match=reason):
             strategy.build(varying, tolerance)
-    with pytest.raises(ValueError, match="needs a tolerance"):
+    with pytest.raises(RequestError, match="needs a tolerance"):
         OfflinePGA().build(varying, None)
 
 

@@ -12,7 +12,7 @@ from numerics import Varying, space
 from scipy.optimize import nnls
 
 from vibench.arrays import Array
-from vibench.errors import NumericalError
+from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.problem import ContactLoads
 from vibench.interfaces.strategies import Cone, Offline, Stop, no_free
 from vibench.reduction import Cubature, cubature
@@ -210,7 +210,7 @@ def test_a_tolerance_beyond_reach_costs_no_other_and_failures_are_named(offline:
     failing.steps = Mock(side_effect=NumericalError("no space to begin with"))  # type: ignore[method-assign]
     with pytest.raises(NumericalError, match=r"^no space to begin with$"):
         grow_through(failing, offline, [1.0])
-    with pytest.raises(ValueError, match="UnitVectors needs a tolerance"):
+    with pytest.raises(RequestError, match="UnitVectors needs a tolerance"):
         UnitVectors().build(offline, None)
 
 
