@@ -114,7 +114,8 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Re
     if coordinates is not None and eta is not None:
         Z, chi = coordinates.vectors(np.eye(coordinates.plain.shape[0])), np.hstack([eta, chi])
     elif eta is not None:
-        basis = Z = model.primal_basis(VariationalInequality(None, np.zeros(0), members["B"].terms[0], np.zeros(0)))
+        B = members["B"].terms[0]
+        basis = Z = model.primal_basis(VariationalInequality(A=None, f=np.zeros(0), B=B, g=np.zeros(0)))
     else:
         Z = model.fixed_basis
     of = projections(Z, chi) | {"g": lambda g: model.generators.T @ g}
@@ -129,7 +130,10 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Re
     # The dual program needs A⁻¹ and independent generators; then queries solve it with one factor.
     dual_is_regular = A.constant and coordinates is None and A.shape[0] >= count == rank > 0
     factor = scipy.linalg.cholesky(A.evaluate(None), lower=True) if dual_is_regular else None
-    return ReducedOperators(sampled, affine, A, f, g, B, on_contact, coordinates, basis, factor)
+    return ReducedOperators(
+        sampled_entries=sampled, affine=affine, A=A, f=f, g=g, B=B, contact_basis=on_contact,
+        supremizer_coordinates=coordinates, basis=basis, factor=factor,
+    )  # fmt: skip
 
 
 def _supremizer_space(model: ReducedModel, B: AffineMember, eta: Array) -> PlainCoordinates:

@@ -67,7 +67,6 @@ def _not_compared(cells: pd.DataFrame) -> Iterator[str]:
     few = cells[cells["queries_ok"] < 0.5 * cells["queries"]]
     if len(few):
         having = f"{_number(len(few), 'cell')} {'has' if len(few) == 1 else 'have'}"
-        # The same half as in `on_common_queries`.
         yield f"{having} fewer than half of the queries ok: such errors are not compared with others."
     timed, disturbed = int(cells["disturbed"].notna().sum()), int((cells["disturbed"] == 1).sum())
     if disturbed:

@@ -230,8 +230,7 @@ def _grids(read: Mapping[str, pd.DataFrame]) -> Iterator[TableGrid]:
             cells,
             "Errors are relative; they are means over the ok queries whose high-fidelity solution is not zero. Where a "
             "run has others, columns u = 0 and λ = 0 have their number and their largest error over the largest "
-            "training norm. Means over other queries are not comparable: figures take those over queries "
-            "that all solved.",
+            "training norm. Means over other queries are not comparable: figures take cells with every query ok.",
         ),
     ]
     model = thresholds["cell_a"].isna()

@@ -7,7 +7,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from vibench.interfaces.strategies import Kind
-from vibench.report.figures import data as tables
 from vibench.report.figures import style
 from vibench.report.figures.data import ProblemTables, label
 from vibench.report.figures.solutions import draw_alone
@@ -52,7 +51,7 @@ def answer(data: ProblemTables) -> CaptionedFigure | None:
     left_out = rivals["primal"].nunique() - len(names)
     lines.append(
         "Lower left, the larger of the mean errors of u and λ against the mean time of a query, a point for every "
-        "model, over the queries that all solved; the black line is a full solution, the dotted one "
+        "model with every query ok; the black line is a full solution, the dotted one "
         f"{100 * verdict.error:g} %." + f" {left_out} other strategies are in the tables." * (left_out > 0)
     )
     _draw_costs(cost, _three(rivals, best), data.thresholds)
@@ -73,11 +72,10 @@ def _empty(panel: Axes, text: str) -> str:
 
 
 def _rivals(data: ProblemTables, best: Row) -> pd.DataFrame:
-    """The cells that are compared with the best one: those of its solver and accuracy, and those without a solver."""
+    """The cells that are compared with the best one, itself included: those of its solver, and those without one."""
     cells = data.cells[eligible(data.cells) & data.cells["online_s"].notna()]
     alike = (cells["solver"] == best["solver"]) & (cells["accuracy"] == best["accuracy"])
-    cells = cells[alike | (cells["solver"] == NO_SUCH_AXIS)]
-    compared = tables.on_common_queries(cells, data.queries)
+    compared = cells[alike | (cells["solver"] == NO_SUCH_AXIS)]
     # Each gain is measured in the rounds of its cell, when the machine had one speed.
     seconds = float(best["hf_s"]) * compared["online_s"].astype(float) / compared["hf_s"].astype(float)
     return compared.assign(error=errors_of_solution(compared), ms=1e3 * seconds)
@@ -104,9 +102,8 @@ def _three(cells: pd.DataFrame, best: Row) -> pd.DataFrame:
     own = cells[cells["cell"] == best["cell"]]
     enriched = cells["enrichment_kind"] != Kind.NONE
     other = cells[enriched != (best["enrichment_kind"] != Kind.NONE)]
-    near = other[other["error"] <= 2.0 * max(float(own["error"].iloc[0]), 0.01)] if len(own) else other
-    chosen = near if len(near) else other
-    return pd.concat([own, chosen.nsmallest(1, "online_s")])
+    near = other[other["error"] <= 2.0 * max(float(own["error"].iloc[0]), 0.01)]
+    return pd.concat([own, (near if len(near) else other).nsmallest(1, "online_s")])
 
 
 def _draw_costs(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame) -> None:

@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 
 from vibench.plugins.registry import default_formulation
-from vibench.qp.status import Status
 from vibench.report.figures.style import Series
 from vibench.results import pictures
 from vibench.results.read import in_order, read_table
@@ -202,21 +201,6 @@ def file_names(labels: list[str]) -> list[str]:
         taken = {*plain, *names}
         names.append(name if plain.count(name) == 1 else next(one for one in numbered if one not in taken))
     return names
-
-
-def on_common_queries(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:
-    """Cells of one problem with means of errors over the queries that are ok in all of them.
-
-    Cells with fewer than half of their queries ok are left out; queries of other cells are ignored.
-    """
-    ok = queries[(queries["status"] == Status.OK) & queries["cell"].isin(cells["cell"])]
-    solved = cells["cell"].map(ok.groupby("cell").size()).fillna(0)
-    # A cell that solved fewer than half would leave the others too few common queries.
-    kept = cells[(solved > 0) & (solved >= 0.5 * cells["queries"])]
-    ok = ok[ok["cell"].isin(kept["cell"])]
-    by = ok.groupby("query")["cell"].nunique()
-    means = ok[ok["query"].isin(by.index[by == len(kept)])].groupby("cell")[["error_u", "error_lambda"]].mean()
-    return kept.assign(**{f"{name}_mean": kept["cell"].map(means[name]) for name in means})
 
 
 def of_solvers(queries: pd.DataFrame) -> pd.DataFrame:
