@@ -51,10 +51,10 @@ def test_every_alteration_of_a_good_site_is_named(script: ModuleType, site: Path
         text = (copied / name).read_bytes().decode("latin-1")
         assert alter(text) != text, name
         (copied / name).write_bytes(alter(text).encode("latin-1"))
-        changed = f"{name} is not what the results files give"
-        digests = "vibench-site.json has other digests than the files"
-        assert list(script.differences(copied, again)) == [changed, digests]
-        (copied / name).write_bytes(text.encode("latin-1"))
+    expected = {f"{name} is not what the results files give" for name in ALTERED}
+    digests = "vibench-site.json has other digests than the files"
+    assert {*script.differences(copied, again)} == expected | {digests}
+    shutil.copytree(site, copied, dirs_exist_ok=True)
     (copied / "publication.json").unlink()
     (copied / "extra.js").touch()
     (copied / "index.html").unlink()

@@ -29,7 +29,7 @@ CORE = Path(provenance.__file__).parent
 COMPILED = ["compiled"] if shutil.which("cc") else []
 
 RANDOM = {"name": "random", "size": 60, "seed": 1}
-GREEDY = {"name": "greedy", "candidates": 20, "tolerance": 0.5, "checked": 5}
+GREEDY = {"name": "greedy", "candidates": 12, "tolerance": 0.5, "checked": 3}
 TOLERANCES = {
     "pod": [1e-2], "dual": [1e-1],
     "primal": {"offline-pga": [0.5, 0.3], "infsup-greedy": [0.5], "pod-supremizers": [0.1]},
