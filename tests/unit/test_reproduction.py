@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+import pandas as pd
 import pytest
 
 from vibench_problems.paper import claims
@@ -17,8 +18,6 @@ from vibench_problems.paper.claims import Agreement
 from vibench_problems.paper.published import HERTZ, OBSTACLE
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "reproduction.md"
-ROW = re.compile(r"^\| (?P<claim>.+?) \| (?P<paper>.*?) \| (?P<ours>.*?) \| (?P<verdict>[a-z ]+?) \| ", re.MULTILINE)
 
 TABLES = {"Table 1": ("(19, 50)", "(51, 70)", "(89, 50)"), "Table 2": ("(3, 12)", "(46, 70)", "(46, 12)")}
 TIMES = ("offline time, on [s]", "offline time, off [s]", "offline time, off / on")
@@ -94,26 +93,25 @@ def test_a_ratio_that_the_paper_leaves_open_is_not_confirmed() -> None:
 
 
 @pytest.fixture(scope="module")
-def page() -> str:
-    return PAGE.read_text(encoding="utf-8")
+def rows() -> pd.DataFrame:
+    return pd.read_csv(ROOT / "docs" / "reproduction.csv", dtype=str, keep_default_na=False)
 
 
-def test_the_page_has_every_row_and_figure_and_their_counts_and_reasons(page: str, reproduction: ModuleType) -> None:
-    named = [row["claim"] for row in ROW.finditer(page)]
+def test_the_page_has_every_row_and_figure_and_their_counts_and_reasons(
+    rows: pd.DataFrame, reproduction: ModuleType
+) -> None:
+    page, named = (ROOT / "docs" / "reproduction.md").read_text(encoding="utf-8"), list(rows["claim"])
     cells = [f"{table}, {column}: {line}" for table, columns in TABLES.items() for column in columns for line in LINES]
     assert [cell for cell in cells if named.count(cell) != 1] == []
-    found = {int(number) for row in ROW.finditer(page) for number in re.findall(r"Fig\. (\d+)", row["claim"])}
-    assert found == set(range(1, 16))
-    found = [row["verdict"] for row in ROW.finditer(page[page.index("## Problem data") :])]
-    counts = [found.count(verdict.value) for verdict in Agreement]
+    assert {int(number) for number in re.findall(r"Fig\. (\d+)", "\n".join(named))} == set(range(1, 16))
+    counts = [int((rows["verdict"] == verdict.value).sum()) for verdict in Agreement]
     assert f"| all | {' | '.join(map(str, counts))} |" in page
-    assert sum(counts) > 150
-    rows = [line for line in page.splitlines() if re.search(r"\| (differs|cannot be compared) \| ", line)]
-    assert [row for row in rows if row.endswith(" |  |")] == []
-    verdicts = {row["claim"]: row["verdict"] for row in ROW.finditer(page)}
+    assert sum(counts) == len(rows) > 150
+    assert (rows.loc[rows["verdict"].isin(["differs", "cannot be compared"]), "why"] != "").all()
     prescribed = [f"Table 2, {pair.name}: {size}" for pair in HERTZ.pairs for size in "NR"]
     copied = ["Hertz, §5.2: E [Pa], ν", "Obstacle, §5.1: load [1/m]", "Obstacle, §5.1: nodes"]
     printed = [f"Table {number}: benefit thresholds from the printed seconds" for number in (1, 2)]
+    verdicts = rows.set_index("claim")["verdict"]
     assert {verdicts[claim] for claim in (*prescribed, *copied, *printed)} == {Agreement.GIVEN.value}
     fit = reproduction.variants()
     assert reproduction.FIT.format(**fit) in page
@@ -145,13 +143,14 @@ def judged_under_figures() -> list[tuple[str, str, str]]:
     return result
 
 
-def test_both_pages_of_the_paper_have_the_same_claims_on_figures(page: str) -> None:
+def test_both_pages_of_the_paper_have_the_same_claims_on_figures(rows: pd.DataFrame) -> None:
     """The other way round: of a figure that is drawn again, the claims of the page stand below it."""
     under_figures = judged_under_figures()
     assert len(under_figures) > 100
-    rows = {(unescaped(r["claim"]).partition(": ")[2], unescaped(r["ours"]), r["verdict"]) for r in ROW.finditer(page)}
-    assert [claim for claim in under_figures if claim not in rows] == []
+    short = rows["claim"].str.partition(": ")[2]
+    known = set(zip(short, rows["vibench"], rows["verdict"], strict=True))
+    assert [claim for claim in under_figures if claim not in known] == []
     statements = {statement for statement, _, _ in judged_under_figures()}
-    of_figures = [unescaped(row["claim"]) for row in ROW.finditer(page) if DRAWN.search(row["claim"])]
+    of_figures = [claim for claim in rows["claim"] if DRAWN.search(claim)]
     missing = {claim for claim in of_figures if claim.partition(": ")[2] not in statements}
     assert {claim for claim in missing if not claim.endswith(", without symmetry")} == set()
