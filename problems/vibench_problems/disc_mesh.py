@@ -141,10 +141,17 @@ def _triangulate_around(
     fixed = np.zeros(len(points), dtype=bool)
     fixed[: len(disc_points)] = True
     fixed |= np.abs(points).max(axis=1) >= 0.5
-    for _ in range(SMOOTHING_SWEEPS):
-        triangles = _delaunay_annulus(points, used, radius)
-        points = _smoothed(points, triangles, fixed)
     triangles = _delaunay_annulus(points, used, radius)
+    smooth = points
+    for _ in range(SMOOTHING_SWEEPS):
+        smooth = _smoothed(smooth, triangles, fixed)
+    if not _are_delaunay(smooth, _quadrilaterals(triangles)):
+        # The lattice is so regular that this is rare.
+        smooth = points
+        for _ in range(SMOOTHING_SWEEPS):
+            smooth = _smoothed(smooth, triangles, fixed)
+            triangles = _delaunay_annulus(smooth, used, radius)
+    points = smooth
     ring = np.sort(np.column_stack([circle, np.roll(circle, -1)]), axis=1)
     edges = np.sort(np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
     unique, count = np.unique(edges, axis=0, return_counts=True)
@@ -168,6 +175,24 @@ def _delaunay_annulus(points: Array, used: NDArray[np.int64], radius: float) -> 
     flip = twice_area[proper] < 0.0
     triangles[flip] = triangles[flip][:, [0, 2, 1]]
     return np.asarray(triangles, dtype=np.int64)
+
+
+def _quadrilaterals(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Corners p, a, b, q (k×4) of all pairs of counter-clockwise triangles p a b and q b a with a common edge a b."""
+    edges = np.sort(triangles[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2), axis=1)
+    order = np.lexsort(edges.T)
+    same = np.flatnonzero((edges[order[1:]] == edges[order[:-1]]).all(axis=1))
+    triangle, corner = np.divmod(order[same], 3)
+    a, b = (triangles[triangle, (corner + i) % 3] for i in (1, 2))
+    return np.column_stack([triangles.ravel()[order[same]], a, b, triangles.ravel()[order[same + 1]]])
+
+
+def _are_delaunay(points: Array, quads: NDArray[np.int64]) -> bool:
+    """Whether no q is inside the circle through p, a, b; round-off in it is left to Qhull."""
+    p, a, b, q = points.T[:, quads.T].swapaxes(0, 1)
+    u, v, w = p - q, a - q, b - q
+    terms = [np.sum(x**2, axis=0) * cross(y, z) for x, y, z in ((u, v, w), (v, w, u), (w, u, v))]
+    return bool(np.all(sum(terms) < -1e-9 * np.sum(np.abs(terms), axis=0)))
 
 
 def _smoothed(points: Array, triangles: NDArray[np.int64], fixed: NDArray[np.bool_]) -> Array:

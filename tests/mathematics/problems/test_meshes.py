@@ -5,6 +5,7 @@ import pytest
 from numerics import doubled_areas
 from skfem import Mesh
 
+from vibench_problems import disc_mesh
 from vibench_problems.disc_mesh import aspect_ratios, disc_in_square, displaced_around_disc, rings_for
 from vibench_problems.graded_mesh import Triangulation, quarter_disc
 
@@ -26,6 +27,22 @@ def test_the_mesh_is_a_triangulation_of_the_square_that_fits_the_disc(nodes: int
     assert np.all(np.linalg.norm(mesh.p[:, mesh.t[:, disc]], axis=0) <= 0.2 * (1.0 + 1e-12))
     assert set(np.unique(mesh.t)) == set(range(mesh.p.shape[1]))
     assert aspect_ratios(mesh.p, mesh.t).max() < 2.0
+
+
+def test_a_mesh_that_is_triangulated_once_is_the_one_triangulated_at_every_sweep(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    once = disc_in_square(300, 0.2)
+    monkeypatch.setattr(disc_mesh, "_are_delaunay", lambda *_: False)
+    other = disc_in_square(300, 0.2)
+    np.testing.assert_allclose(once.p, other.p, atol=1e-14)
+    one, two = ({tuple(sorted(corners)) for corners in mesh.t.T.tolist()} for mesh in (once, other))
+    assert one == two
+    quads = disc_mesh._quadrilaterals(np.array([[0, 1, 2], [0, 2, 3]]))
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    monkeypatch.undo()
+    for x, expected in ((0.9, False), (1.1, True)):  # of the corner 0, on the circle through the others for x = 1
+        assert disc_mesh._are_delaunay(square + np.outer([0, 0, 0, 1], [1.0 - x, x - 1.0]), quads) is expected
 
 
 def test_the_mesh_is_always_the_same() -> None:
