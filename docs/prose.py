@@ -14,7 +14,7 @@ from statistics import median
 
 ROOT = Path(__file__).parents[1]
 # Lists of names, and claims that are compared one by one.
-OTHERS = {"api", "bibliography", "changelog", "contributing", "glossary", "reproduction", "commands", "tables"}
+OTHERS = {"api", "changelog", "contributing", "glossary", "reproduction", "commands", "tables"}
 NUMBER = re.compile(r"(?<![\w.])\d[\d.,]*(?:e-?\d+)?")
 CHAINS = re.compile(r"\b(those of|that of the|of which)\b")
 
@@ -30,7 +30,7 @@ def sentences(text: str) -> Iterator[str]:
     text = re.sub(r"^(```|~~~).*?^\1", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"<!-- generated: .*?<!-- end: .*? -->|<!--.*?-->|\$\$.*?\$\$", "", text, flags=re.DOTALL)
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", re.sub(r"`[^`\n]*`|\$[^$\n]*\$", "code", text))
-    text = re.sub(r"^\|.*$|^#.*$|^ {4,}\S.*$|^[!?]{3}.*$|^-+$", "\n", text, flags=re.MULTILINE)
+    text = re.sub(r"^\|.*$|^#.*$|^<a id=.*$|^ {4,}\S.*$|^[!?]{3}.*$|^-+$", "\n", text, flags=re.MULTILINE)
     for part in re.split(r"\n\s*\n|^\s*(?:[-*+]|\d+\.)\s", text, flags=re.MULTILINE):
         plain = " ".join(re.sub(r"<[^>]*>|[*_]{1,2}(?=\S)|(?<=\S)[*_]{1,2}", "", part).split())
         yield from filter(None, re.split(r"(?<=[.!?:;])\s+(?=[A-ZÄÖÜ(]|code\b)", plain))
