@@ -225,6 +225,7 @@ def test_the_example_of_the_reference_is_a_study_and_its_rules_are_rules(tmp_pat
     ("page", "texts", "written"),
     [
         ("library.md", 13, {"runs", "tables", "decision.html", "answer.svg"}),
+        ("measurement.md", 0, set()),
         ("tolerances.md", 2, {"runs"}),
         ("methods.md", 35, {"runs", "points.npy"}),
     ],
