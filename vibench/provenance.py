@@ -12,7 +12,7 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
 
-# Version of the benchmark protocol, recorded in results; docs/benchmark.md has a line for each. It changes with every
+# Version of the benchmark protocol, recorded in results; docs/publishing.md has a line for each. It changes with every
 # change after which seconds, or the meaning of a number, can no longer be compared with earlier ones.
 PROTOCOL = "4"
 

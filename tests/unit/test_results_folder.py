@@ -255,7 +255,7 @@ def test_other_machines_are_compared_row_by_row(tmp_path: Path) -> None:
 def test_citations_and_the_lock_file_agree_with_the_project() -> None:
     """Title, author, version and year on the page of the benchmark and in CITATION.cff."""
     entry = re.compile(r"^@software\{vibench,\n.*?^\}$", re.MULTILINE | re.DOTALL)
-    (first,) = entry.findall((ROOT / "docs" / "benchmark.md").read_text(encoding="utf-8"))
+    (first,) = entry.findall((ROOT / "docs" / "publishing.md").read_text(encoding="utf-8"))
     fields = {name: value.strip("{}") for name, value in re.findall(r"^  (\w+) = \{(.*)\},$", first, re.MULTILINE)}
     text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert text.count(f'title: "{fields["title"]}"') == 2
