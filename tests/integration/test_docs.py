@@ -41,7 +41,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 RESULTS = [ROOT / "README.md", *sorted((ROOT / "results").rglob("*.md"))]
 PAGES = sorted(DOCS.rglob("*.md"))
-EXTEND = sorted((DOCS / "extend").glob("*.md"))
+EXTEND = [DOCS / "problem.md", DOCS / "method.md"]
 
 BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
@@ -89,14 +89,6 @@ def importable(package: Path, register: Register, monkeypatch: pytest.MonkeyPatc
     yield
     for name in [name for name in sys.modules if name.split(".")[0] == "vibench_mine"]:
         del sys.modules[name]
-
-
-@pytest.mark.usefixtures("importable")
-@pytest.mark.parametrize("page", EXTEND, ids=lambda page: page.stem)
-def test_what_a_page_looks_at_is_as_it_says(page: Path) -> None:
-    for language, title, text in blocks(page):
-        if language == "python" and not title:
-            exec(compile(text, f"<{page.name}>", "exec"), {"__name__": "documentation"})
 
 
 @pytest.mark.usefixtures("importable")
@@ -220,11 +212,13 @@ def test_the_example_of_the_reference_is_a_study_and_its_rules_are_rules(tmp_pat
         assert str(caught.value) == f"{path}: {refused.strip()}"
 
 
-@pytest.mark.usefixtures("few_rounds")
+@pytest.mark.usefixtures("few_rounds", "importable")
 @pytest.mark.parametrize(
     ("page", "texts", "written"),
     [
-        ("library.md", 13, {"runs", "tables", "decision.html", "answer.svg"}),
+        ("problem.md", 3, {"runs"}),
+        ("method.md", 0, set()),
+        ("report.md", 5, {"runs", "tables", "decision.html", "answer.svg"}),
         ("measurement.md", 0, set()),
         ("tolerances.md", 2, {"runs"}),
         ("methods.md", 35, {"runs", "points.npy"}),
@@ -235,10 +229,10 @@ def test_a_page_is_true(
 ) -> None:
     """Its examples build on each other; what one prints is in the block that follows it."""
     monkeypatch.chdir(tmp_path)
-    parts, names = blocks(DOCS / page), dict[str, Any]()
+    parts, names = blocks(DOCS / page), {"__name__": "documentation"}
     compared = 0
-    for (language, _, code), (following, _, text) in pairwise([*parts, ("", "", "")]):
-        if language != "python":
+    for (language, title, code), (following, _, text) in pairwise([*parts, ("", "", "")]):
+        if language != "python" or title:  # a title is the name of a file of the package
             continue
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             exec(compile(code, "<documentation>", "exec"), names)

@@ -17,7 +17,7 @@ AUTHORS = sorted(
     path
     for pattern in (
         "problems/**/*.py", "strategies/**/*.py", "examples/**/*.py", "vibench/cli/templates/*.template",
-        "docs/extend/*.md", "docs/tutorial.md", "README.md",
+        "docs/problem.md", "docs/method.md", "docs/tutorial.md", "README.md",
     )
     for path in ROOT.glob(pattern)
 )  # fmt: skip
