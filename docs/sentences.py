@@ -33,7 +33,7 @@ def cells(study: str) -> pd.DataFrame:
 
 
 def cones() -> Sequence[str]:
-    """What the page on the study `field` says of cones: sizes, errors, conditioning."""
+    """What the page of comparisons says of cones: sizes, errors, conditioning."""
     table = cells("field")
     chosen = table[(table["assembly"] == "full") & (table["pod_tol"] == 1e-3)]
     by, bare = (
@@ -86,7 +86,7 @@ def misses(study: str, problem: str) -> tuple[int, pd.DataFrame]:
 
 
 def guarantees() -> Sequence[str]:
-    """What the page on the study `field` says of shares off the training set."""
+    """What the page of comparisons says of shares off the training set."""
     rows = []
     for study, problems in (("field", ("hertz", "obstacle")), ("paper-hertz", ("hertz",)),
                             ("paper-obstacle", ("obstacle",))):  # fmt: skip
@@ -115,15 +115,7 @@ def slowest() -> Sequence[str]:
     slowest = table.loc[table.groupby(["problem", "assembly", "pod_tol", "dual"])["online_s"].idxmax()]
     others = slowest[slowest["primal"] != ONLINE]
     assert set(others["problem"]) == {"hertz"}
-    assert set(others["primal"]) == {"pod-supremizers"}
-    assert set(others["dual"][others["assembly"] == "reduced"]) == {"dictionary"}
-    full = others[(others["assembly"] == "full") & (others["pod_tol"] == 1e-3)]
-    assert len(full) > table["dual"].nunique() / 2
-    assert set(full["primal_tol"]) == {0.01}
-    return (
-        "has the slowest queries on the obstacle",
-        "`pod-supremizers` with δ = 0.01 is slower on Hertz with most cones",
-    )
+    return ("has the slowest queries on the obstacle",)
 
 
 def setting() -> Sequence[str]:
@@ -161,7 +153,6 @@ def cones_and_controls() -> Sequence[str]:
     assert online.loc["obstacle", "R"].idxmin() == "nmf"
     assert online.loc["hertz", "error_lambda_mean"].idxmin() == "dictionary"
     assert online.loc[("hertz", "dictionary"), "R"] == 9 * online.loc[("hertz", "cpg"), "R"]
-    assert online.loc[("obstacle", "nmf"), "fallbacks"] == "the factorisation was stopped after 1000 iterations"
     assert online.loc[("obstacle", "mcpg"), "rank"] == online.loc[("obstacle", "mcpg"), "R"]
     control = tight(table, control=True)
     assert control["error_lambda_mean"][control["primal"] != BARE].min() > 0.15
@@ -175,7 +166,6 @@ def cones_and_controls() -> Sequence[str]:
     assert (cone < 0.25 * enriched).loc["obstacle"].all()
     low, high = percent(error.loc["obstacle"])
     return (
-        f"Over the span β is {bare['beta_span_min'].max():.0e} at best".replace("e-05", "e-5"),
         f"min β over the cone on Hertz is {cone['hertz', 'cpg']:.2f}, and the mean error of λ is "
         f"{percent(error.loc['hertz'].loc[snapshots])[1]} % at most",
         f"between {low} % and {high} %",
@@ -196,8 +186,7 @@ def enrichments() -> Sequence[str]:
         assert all(min(share) == share[-1] for share in loose)
         assert (min(last), max(last)) == (last[0], last[-1])
     greedy = [rows.loc[("infsup-greedy", 0.7), "enrichment"] for rows in (hertz, obstacle)]
-    pga, stopped = hertz.loc[("offline-pga", 0.6)], hertz.loc[("offline-pga (stop on β)", 0.7)]
-    more = hertz.loc[("offline-pga", 0.3)]
+    pga = hertz.loc[("offline-pga", 0.6)]
     loose, fine = hertz.loc[("pod-supremizers", 0.1)], obstacle.loc[("pod-supremizers", 0.01)]
     online = tight(table)[lambda rows: (rows["primal"] == ONLINE) & (rows["dual"] == "mcpg")].set_index("problem")
     above = [
@@ -207,48 +196,13 @@ def enrichments() -> Sequence[str]:
     ]
     assert loose["enrichment"] == fine["enrichment"] == 59
     assert f"{100.0 * max(above):.1f}" == "0.1"
-    lower = [stopped[name] / more[name] for name in ("error_u_mean", "error_lambda_mean")]
     return (
         f"it has {loose['enrichment']} vectors and a share of {loose['share_training']:.2f}",
         f"with 0.7 it stops at {greedy[0]} vectors on Hertz and at {greedy[1]} on the obstacle",
         f"its {pga['enrichment']} vectors reach {pga['share_training']:.2f} over the training set and "
         f"{pga['share_validation']:.2f} over the validation set",
-        f"{stopped['enrichment']} vectors for 0.7, where σ guarantees {stopped['share_guaranteed']:.2f}",
-        f"{more['enrichment']} vectors instead of {stopped['enrichment']} divide both errors by at least "
-        f"{np.floor(10.0 * min(lower)) / 10.0:g}",
         f"With {fine['R']} generators and {fine['N']} modes",
         f"such as {fine['enrichment']} of `pod-supremizers`, have errors that are at most {100.0 * max(above):.1f} %",
-    )
-
-
-def fronts() -> Sequence[str]:
-    """What it says of Pareto fronts and of the fastest queries."""
-    table = cells("field")
-    (front,) = [one for one in page_tables("field") if {"cost", "is"} <= set(one)]
-    sized = front[front["cost"] == "N + S + R"]
-    hertz, obstacle = (sized[sized["problem"] == name] for name in ("hertz", "obstacle"))
-
-    def ends(dual: str, low: float, high: float) -> tuple[int, int]:
-        on = obstacle[(obstacle["dual"] == dual) & obstacle["is"].between(low, high)]["is"]
-        assert set(obstacle[obstacle["is"].between(on.min(), on.max())]["dual"]) == {dual}
-        return int(on.min()), int(on.max())
-
-    reduced = table[(table["assembly"] == "reduced") & (table["pod_tol"] == 1e-3)]
-    plain = reduced[(reduced["primal"] == BARE) & (reduced["problem"] == "hertz")].set_index("dual")
-    assert plain.loc["cpg", "error_lambda_mean"] == plain.loc["angle-greedy", "error_lambda_mean"]
-    assert plain.loc["dictionary", "N"] == 9
-    # their errors are equal but for round-off, which decides who is on the front
-    first = hertz[hertz["dual"].isin(["angle-greedy", "cpg"]) & (hertz["primal"] == BARE)].iloc[0]
-    second = hertz[(hertz["dual"] == "nmf") & (hertz["error λ"] < first["error λ"])].iloc[0]
-    return (
-        f"with an error of {plain.loc['dictionary', 'error_lambda_mean']:.1e}".replace("e-0", "e-"),
-        f"`cpg` without enrichment ({first['is']:.0f} unknowns) and `nmf` with online supremizers ({second['is']:.0f})",
-        "`nmf` is on the front from dimension {} to {} and `orthant` from {}".format(
-            *ends("nmf", 100, 200), ends("orthant", 100, 200)[0]
-        ),
-        "`nmf` is on it at {} and {}. `enlarged-cpg` follows from {} to {}".format(
-            *ends("nmf", 25, 40), *ends("enlarged-cpg", 0, 100)
-        ),
     )
 
 
@@ -264,7 +218,7 @@ def formulation_name(name: str) -> str:
 
 
 def formulations() -> Sequence[str]:
-    """What the page on formulations says of times and errors beside those of `mixed`, and of less training."""
+    """What it says of formulations: times and errors beside those of `mixed`, and less training."""
     table = every_formulation()
     assert (table["queries_ok"] == table["queries"]).all()
     key = ["problem", "dual", "pod_tol", "training"]
@@ -292,6 +246,9 @@ def formulations() -> Sequence[str]:
     grown = np.log(errors_of[["half", "inner"]].div(errors_of["own"], axis=0))
     growth = np.exp(grown.groupby(level=["formulation", "problem"]).mean()).reset_index("problem", drop=True)
     kinds, told = growth.groupby(growth.index.str.split().str[0]), ("mixed", "local", "regression")
+    meaning = pd.read_csv(ROOT / "results" / "formulations" / "thresholds.csv").groupby("formulation_b")["meaning"]
+    assert set(meaning.get_group("regression (radial)")) == {"at once"}
+    assert set(meaning.get_group("proximal")) == {"never"}
     levels, *_ = page_tables("formulations")
     (compiled,) = [table for table in page_tables("formulations") if "query / compiled" in table]
     best = levels.groupby("problem").last()
@@ -314,37 +271,6 @@ def formulations() -> Sequence[str]:
     )
 
 
-def break_evens() -> Sequence[str]:
-    """What the page on formulations says of when they are cheaper than `mixed`."""
-    table = pd.read_csv(ROOT / "results" / "formulations" / "thresholds.csv")
-    assert (table["formulation_a"] == "mixed").all()
-    assert set(table.groupby("formulation_b").size()) == {16}
-    of, meaning = table["formulation_b"], table["meaning"]
-    verdicts = ("at once", "from", "until", "as fast", "undecided", "never")
-    assert set(meaning) == set(verdicts)
-    rows = []
-    for name, mine in table.groupby("formulation_b"):
-        counts = mine["meaning"].value_counts().reindex(verdicts, fill_value=0)
-        numbers = mine["benefit_threshold"][mine["meaning"] == "from"]
-        starts = " to ".join(dict.fromkeys(f"{end:.0f}" for end in (numbers.min(), numbers.max())))
-        rows.append([formulation_name(name), *counts[:2], starts if len(numbers) else "–", *counts[2:]])
-    assert (meaning[of == "regression (radial)"] == "at once").all()
-    assert (meaning[of == "proximal"] == "never").all()
-    assert set(table["dual"][(of == "sparse-dictionary") & (meaning == "never")]) == {"mcpg"}
-    hyper, undecided = of.str.startswith("hyper-reduced"), meaning == "undecided"
-    offline = undecided & table["rounds_missing"].isna()
-    others = table[undecided & ~offline]
-    timed = every_formulation().set_index("cell").loc[others["cell_b"]]
-    missing = others["rounds_missing"].to_numpy()
-    (most,) = timed["timing_rounds"].unique()
-    return (
-        table_rows(rows),
-        f"{undecided.sum()} of the {len(table)} pairs are undecided, {(undecided & hyper).sum()} of them of",
-        f"In {offline.sum()} the offline seconds are too close, and further rounds would not change that. The others "
-        f"need {span(missing)} more rounds than they had (`rounds_missing`), where {most} are permitted",
-    )
-
-
 def page_tables(study: str) -> list[pd.DataFrame]:
     """The Markdown tables of a page of results, in their order."""
     text = (ROOT / "results" / study / "README.md").read_text(encoding="utf-8")
@@ -358,8 +284,8 @@ def page_tables(study: str) -> list[pd.DataFrame]:
 
 
 def certified() -> Sequence[str]:
-    """What the page on certified models says of effectivities, corrections, certificates and greedy training."""
-    medians, largest, costs, corrected, _, runs, *_ = page_tables("certified")
+    """What it says of certified models: effectivities, corrections, certificates and greedy training."""
+    medians, largest, costs, corrected, *_ = page_tables("certified")
     norms = ("u in the energy norm", "u in V", "λ in the natural norm", "λ in W")
     kinds = {"(ii)": "(ii) at high-fidelity cost", "(ii) online": "(ii) at online cost",
              "HSW": "Haasdonk, Salomon and Wohlmuth"}  # fmt: skip
@@ -376,7 +302,6 @@ def certified() -> Sequence[str]:
     takes = {key: span(some) for key, some in share}
     gains = ["λ without / with online", "λ without / with in full"]
     of_obstacle = corrected[corrected["problem"] == "obstacle"]
-    shown = of_obstacle[(of_obstacle["training"] == "own") & (of_obstacle["primal"] == "offline-pga")]
     least = of_obstacle[["error λ", "error λ online"]].min()
     training = pd.read_csv(ROOT / "results" / "certified" / "training.csv")
     equal = training[training["largest ratio of errors"] <= 1.0]
@@ -387,22 +312,9 @@ def certified() -> Sequence[str]:
     assert set(equal["greedy dual"][(equal["paper"] == "yes") & ~equal.index.isin(orthant.index)]) == {"mcpg"}
     assert set(orthant["greedy dual"]) == {"orthant"}
     slower = orthant["greedy query [ms]"] / orthant["fixed query [ms]"]
-    errors = ["error u", "largest error u", "error λ", "largest error λ"]
-    mine = runs[(runs["problem"] == "obstacle") & (runs["dual"] == "mcpg")].set_index("primal")
-    closest = []
-    for primal in (OFFLINE, ONLINE):
-        rows = mine.loc[primal]
-        kept = (rows["δ_POD"] == 1e-4) & (rows["δ_dual"] == 1e-3) & (rows["training"] == "own")
-        ratios = rows.loc[rows["training"] == "greedy", errors] / rows.loc[kept, errors].iloc[0]
-        closest.append(ratios.max(axis=1).min())
-    assert min(closest) > 1.0
     return (
         table_rows(effectivities),
         table_rows([name, *(takes[how, name.lower()] for how in ("own", "greedy"))] for name in ("obstacle", "Hertz")),
-        *(
-            f"| {share:.0f} % | {' | '.join(f'{factor:.3g}' for factor in factors)} |"
-            for share, factors in zip(100.0 * shown["ω &gt; ρ online"], shown[gains].to_numpy(), strict=True)
-        ),
         *(
             f"| {100.0 * rows['ω &gt; ρ online'].min():.0f} to {100.0 * rows['ω &gt; ρ online'].max():.0f} % | "
             f"{' | '.join(f'{rows[name].min():.3g} to {rows[name].max():.3g}' for name in gains)} |"
@@ -411,32 +323,24 @@ def certified() -> Sequence[str]:
         f"{least['error λ']:.2e} without correction and {least['error λ online']:.2e} with".replace("e-0", "e-"),
         f"{orthant['greedy R'].max()} generators instead of {orthant['fixed R'].max()}. Queries take "
         f"{slower.mean():.1f} times as long",
-        "{:.1f} and {:.1f}".format(*sorted(closest)),
-        "{:.1f}, {:.1f} and {:.1f}".format(*sorted(missed["largest ratio of errors"])),
     )
 
 
 def unseen_parameters() -> Sequence[str]:
-    """What the page on certified models says of random parameters that no training set has."""
+    """What it says of random parameters that no training set has."""
     table = pd.read_csv(ROOT / "results" / "certified" / "unseen.csv")
     assert (table["violations"] == 0).all()
     assert (table["without a bound"] == 0).all()
-    effectivities, corrections = [], []
+    effectivities = []
     for name in ("obstacle", "Hertz"):
         values = table[table["problem"] == name.lower()]
         effectivities.append([name])
         for vector in ("u", "λ"):
             middle, least = values[f"median effectivity of {vector}"], values[f"least effectivity of {vector}"]
             effectivities[-1] += [f"{middle.min():.2f} to {middle.max():.2f}", f"{least.min():.4g}"]
-        for where, formula in (("ω > ρ", r"$\omega > \rho$"), ("ω ≤ ρ", r"$\omega \le \rho$")):
-            factor = values[f"error of λ divided by (median), corrected online, {where}"]
-            smaller = 100.0 * values[f"smaller in, corrected online, {where}"]
-            ends = dict.fromkeys(f"{end:.3g}" for end in (smaller.min(), smaller.max()))
-            corrections.append([name, formula, f"{' to '.join(ends)} %", span(factor)])
     return (
         f"in the {table['parameters'].sum():,} queries of the {len(table)} models",
         table_rows(effectivities),
-        table_rows(corrections),
     )
 
 
@@ -450,10 +354,6 @@ def ladder(rows: pd.DataFrame, column: str, dual: str, primal: str, digits: int 
 def of_models(rows: pd.DataFrame) -> dict[str, str]:
     """What the table on three dimensions says of the models on one mesh, or of those of the plane."""
     enriched = rows.loc[(rows["primal"] != BARE) & (rows["pod_tol"] == rows["dual_tol"]), "beta_span_min"]
-    cones = {
-        f"β over the cone, `{dual}`, {name}": ladder(rows, "beta_cone_lower_min", dual, primal)
-        for dual in ("cpg", "mcpg") for name, primal in (("not enriched", BARE), ("offline PGA", OFFLINE))
-    }  # fmt: skip
     errors = {
         f"error of λ, `{dual}`, {name}": ladder(rows, "error_lambda_mean", dual, primal)
         for dual in ("cpg", "mcpg") for name, primal in (("not enriched", BARE), ("offline PGA", OFFLINE))
@@ -464,7 +364,6 @@ def of_models(rows: pd.DataFrame) -> dict[str, str]:
         "generators of `mcpg`": ladder(rows, "R", "mcpg", BARE, 3),
         "vectors of offline PGA, `mcpg`": ladder(rows, "enrichment", "mcpg", OFFLINE, 3),
         "β over the span, enriched": span(enriched),
-        **cones,
         "error of u, `mcpg`, offline PGA": ladder(rows, "error_u_mean", "mcpg", OFFLINE),
         **errors,
     }
@@ -474,21 +373,12 @@ def of_costs(rows: pd.DataFrame, page: str) -> dict[str, str]:
     """What it says of seconds and bounds of the models on one mesh; break-even is that of the page."""
     kinds = {kind: rows[rows["assembly"] == kind] for kind in ("reduced", "certified")}
     certified, label = kinds["certified"], str(rows["problem"].iloc[0])
-    share = 100.0 * rows["offline_snapshots_s"] / rows["offline_s"]
     pattern = rf"\| {label} +\|[^|]+\|[^|]+\| high-fidelity +\|[^|]+\| (reduced|certified) +\|[^|]+\| from (\d+)"
     starts = {kind: [int(start) for found, start in re.findall(pattern, page) if found == kind] for kind in kinds}
-    gains = {
-        kind: span(some[some["primal"] == ONLINE].set_index(["dual", "pod_tol"])["online_s"]
-                   / some[some["primal"] == OFFLINE].set_index(["dual", "pod_tol"])["online_s"])
-        for kind, some in kinds.items()
-    }  # fmt: skip
     each = {
         kind: {
             f"{kind} query [ms]": span(1e3 * some["online_s"]),
-            f"{kind}: online over offline enrichment": gains[kind],
             f"{kind}: pays from, queries": f"{min(starts[kind])} to {max(starts[kind])}",
-            f"{kind}: snapshots, share of offline seconds": f"{share[some.index].min():.0f} to "
-            f"{share[some.index].max():.0f} %",
         }
         for kind, some in kinds.items()
     }
@@ -496,32 +386,23 @@ def of_costs(rows: pd.DataFrame, page: str) -> dict[str, str]:
         "high-fidelity solution [s]": span(rows["hf_s"]),
         **each["reduced"],
         **each["certified"],
-        "certificate and base [s]": f"{certified['offline_certificate_s'].min():.0f} to "
-        f"{certified['offline_certificate_s'].max():.0f}",
         "effectivity of u, online": span(certified["effectivity_online_u_energy_median"]),
         "effectivity of λ, online": span(certified["effectivity_online_lambda_natural_median"]),
-        "effectivity of u, high-fidelity": span(certified["effectivity_u_energy_median"]),
     }
 
 
 def elliptic_contact() -> Sequence[str]:
-    """What the page on three dimensions says of differences from Hertz's contact; orders are asserted below `fine`."""
+    """What the gallery says of differences from Hertz's contact."""
     page = (ROOT / "results" / "three-dimensions" / "README.md").read_text(encoding="utf-8")
     lines = [line.strip("| ").split("|") for line in re.findall(r"^\| (?:coarse|medium|paper|fine) .*$", page, re.M)]
     names = ["mesh", "n", "m", "mu", "force", "flat", "peak", "a", "b", "in contact", "active sets", "seconds"]
     table = pd.DataFrame([dict(zip(names, map(str.strip, line), strict=False)) for line in lines])
     table = table.astype(dict.fromkeys(["n", "m", *names[4:]], float))
     table["axes"] = table[["a", "b"]].abs().max(axis=1)
-    largest = table.groupby("n").agg(dict.fromkeys(["force", "peak", "axes", "flat"], lambda each: each.abs().max()))
-    assert (largest.loc[largest.index > 20_000, ["force", "peak", "axes"]] < [0.02, 0.01, 0.01]).all(axis=None)
-    flat = table.pivot_table(index="mu", columns="m", values="flat")
-    assert (flat.diff(axis=1).iloc[:, 1:] < 0.0).all(axis=None)
-    orders = (np.log(flat).diff(axis=1) / -np.log(np.sqrt(flat.columns.to_series())).diff()).to_numpy()[:, 1:3]
-    assert orders.min() > 1.4
+    largest = table.groupby("n").agg(dict.fromkeys(["force", "peak", "axes"], lambda each: each.abs().max()))
+    assert (largest[largest.index > 20_000] < [0.02, 0.01, 0.01]).all(axis=None)
     rows = table.groupby("n")[["mesh", "m"]].first().join(largest)
     seconds = table.groupby("n")["seconds"].median()
-    growth = (np.log(seconds).diff() / np.log(seconds.index.to_series()).diff()).iloc[1:]
-    assert growth.is_monotonic_increasing
     return (
         table_rows(
             [
@@ -533,13 +414,11 @@ def elliptic_contact() -> Sequence[str]:
             ]
             for n, one in rows.iterrows()
         ),
-        f"from {growth.min():.1f} to {growth.max():.1f}",
-        f"between 1.4 and {orders.max():.1f}",
     )
 
 
 def space() -> Sequence[str]:
-    """The table of the page on three dimensions, by mesh and in the plane."""
+    """What it says of contact in space, by mesh and beside the plane."""
     table = pd.read_csv(ROOT / "results" / "three-dimensions" / "cells.csv")
     assert (table["queries_ok"] == table["queries"]).all()
     assert (table["bound_online_violations"].fillna(0.0) == 0.0).all()
@@ -553,13 +432,11 @@ def space() -> Sequence[str]:
     for rows, smaller in ((table, True), (plane, False)):  # than the number of generators
         added = rows[(rows["primal"] == OFFLINE) & (rows["dual"] == "mcpg") & (rows["pod_tol"] == rows["dual_tol"])]
         assert ((added["enrichment"] < added["R"]) == smaller).all()
-    certified = table[table["assembly"] == "certified"]
-    costs = certified.groupby("dim_V")[["offline_snapshots_s", "offline_certificate_s"]].median()
-    orders = np.log(costs).diff().div(np.log(costs.index.to_series()).diff(), axis=0).iloc[-1]
-    least = 1e3 * certified.groupby("dim_V")["online_certify_s"].mean()
     short = table[["offline_pod_s", "offline_cone_s", "offline_enrichment_s"]].sum(axis=1).groupby(table["dim_V"]).max()
     sized = table.set_index(["dual", "primal", "pod_tol", "dual_tol", "assembly", "N", "R", "enrichment"])
-    finer, coarser = (sized.loc[sized["dim_V"] == edge, "online_s"] for edge in (costs.index[-1], costs.index[0]))
+    finer, coarser = (
+        sized.loc[sized["dim_V"] == edge, "online_s"] for edge in (table["dim_V"].max(), table["dim_V"].min())
+    )
     ratios = (finer / coarser).dropna()
     (pairs,) = [one for one in page_tables("three-dimensions") if "pays, in queries" in one]
     pays = pairs[pairs["in place of"] == ONLINE].groupby("assembly")["pays, in queries"].value_counts()
@@ -570,11 +447,8 @@ def space() -> Sequence[str]:
         f"for certified ones this is undecided in {of_certified['undecided']} of {of_certified.sum()} pairs, and in "
         f"{of_certified['as fast']} the queries are as fast",
         table_rows([name, *(one.get(name, "–") for one in columns)] for name in columns[0]),
-        f"up to {certified['effectivity_u_energy_median'].max():.2g} times the error of u",
-        f"{orders['offline_snapshots_s']:.1f} | {orders['offline_certificate_s']:.1f}",
         f"take at most {short.iloc[0]:.2g} s at `medium` and {short.iloc[-1]:.2g} s at `paper`",
-        f"a certificate takes {least.iloc[0]:.1f} ms at `medium` and {least.iloc[-1]:.1f} ms at `paper`",
-        " | ".join(span(ratios.xs(kind, level="assembly")) for kind in ("reduced", "certified")),
+        span(ratios.xs("certified", level="assembly")),
     ]
 
 
@@ -755,7 +629,7 @@ def first_page() -> Sequence[str]:
 TOPICS: dict[str, Callable[[], Sequence[str]]] = {
     topic.__name__: topic
     for topic in (
-        cones, guarantees, slowest, setting, cones_and_controls, enrichments, fronts, formulations, break_evens,
+        cones, guarantees, slowest, setting, cones_and_controls, enrichments, formulations,
         certified, unseen_parameters, elliptic_contact, space, first_page, enriching, chosen_cone,
         chosen_solver, chosen_assembly, chosen_formulation, chosen_training, when_not,
     )

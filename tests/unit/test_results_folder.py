@@ -122,7 +122,7 @@ def test_the_tables_of_readme_and_conclusions_are_those_of_committed_cells() -> 
 def test_sentences_are_made_from_the_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
     sentences = importlib.import_module("sentences")
-    page = (ROOT / "docs" / "field.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "compared.md").read_text(encoding="utf-8")
     (place,) = (found[0] for found in sentences.PLACE.finditer(page) if "it has 57 generators" in found[0])
     assert sentences.rendered(place.replace("57 generators", "58 generators")) == sentences.rendered(place)
     assert "it has 57 generators" in sentences.rendered(place)

@@ -242,7 +242,7 @@ class Reduction:
         return certificate_base(self.problem, self.members, self.decomposed)
 
     def certificate_of(self, reduced: AnyReducedModel) -> OnlineCertificate:
-        """The certificate of a reduced model (`docs/certified.md`); an `UnsupportedError` where none is possible."""
+        """The certificate of a reduced model (`docs/tolerances.md`); an `UnsupportedError` where none is possible."""
         if not isinstance(reduced, HyperReducedModel):
             why = "as asked for" if self.assembly == "full" else self.operators
             needed = "a certificate at online cost needs reduced assembly"
