@@ -71,12 +71,17 @@ def units() -> str:
 
 
 def columns(table: str) -> str:
-    """The columns of a table of the results, with SQLite's type, unit and meaning."""
+    """The columns of a table of the results, with type, unit and meaning; what `cells` has, too, by name only."""
     described = dict(STORED[table])
     if table == "queries":
         described["mu_1, mu_2, …"] = column_of("queries", "mu_1")
-    rows = [(f"`{name}`", c.kind.split()[0].lower(), c.unit or "–", c.meaning) for name, c in described.items()]
-    return markdown(("column", "type", "unit", "meaning"), rows)
+    shared = [name for name, c in described.items() if table != "cells" and STORED["cells"].get(name) == c]
+    rows = [
+        (f"`{name}`", c.kind.split()[0].lower(), c.unit or "–", c.meaning)
+        for name, c in described.items() if name not in shared
+    ]  # fmt: skip
+    head = f"As in [cells](#cells): {', '.join(f'`{name}`' for name in shared)}.\n\n" if shared else ""
+    return head + markdown(("column", "type", "unit", "meaning"), rows)
 
 
 def summary() -> str:

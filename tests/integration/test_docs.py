@@ -151,8 +151,10 @@ def test_columns_fields_and_tables_of_the_reference_are_complete(reference: Modu
             line = rf"^\| `{name}` \| .+ \| .* \| {re.escape(field.description)} \|$"
             assert re.search(line, page, re.MULTILINE), name
     for table, stored in schema.STORED.items():
-        names = re.findall(r"^\| `([^`]+)` ", reference.GENERATED[table](), re.MULTILINE)
-        assert names == [*stored, *(["mu_1, mu_2, …"] if table == "queries" else [])]
+        shared, _, own = reference.GENERATED[table]().rpartition("\n\n")
+        names = re.findall(r"`([^`]+)`", shared) + re.findall(r"^\| `([^`]+)` ", own, re.MULTILINE)
+        assert sorted(names) == sorted([*stored, *(["mu_1, mu_2, …"] if table == "queries" else [])])
+        assert all(stored[name] == schema.STORED["cells"][name] for name in re.findall(r"`([^`]+)`", shared))
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     assert set(re.findall(r"<!-- generated: ([\w-]+) -->", text)) == set(reference.GENERATED)
     assert len(reference.PLACE.findall(text)) == text.count("<!-- generated: ")
