@@ -1,7 +1,8 @@
 """The sentences of the pages that people read: none is long, none is full of numbers, and none chains genitives.
 
 `python docs/prose.py` prints every sentence that is not so, with its page, and what is wrong; with exit code 1.
-Tables, code, formulas and what is generated are no prose.
+Tables, code, formulas and what is generated are no prose. It also counts pages, words, entries of the menu, and
+pictures: the site stays one that can be read.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ from pathlib import Path
 from statistics import median
 
 ROOT = Path(__file__).parents[1]
+# Made from docstrings, or included from elsewhere.
+ELSEWHERE = {"api", "changelog", "contributing", "glossary"}
 # Lists of names, and claims that are compared one by one.
-OTHERS = {"api", "changelog", "contributing", "glossary", "reproduction", "commands", "tables"}
+OTHERS = ELSEWHERE | {"reproduction", "commands", "tables"}
 NUMBER = re.compile(r"(?<![\w.])\d[\d.,]*(?:e-?\d+)?")
 CHAINS = re.compile(r"\b(those of|that of the|of which)\b")
 
@@ -46,9 +49,26 @@ def faults(sentence: str) -> Iterator[str]:
         yield f"'{chain[0]}'"
 
 
+def excesses() -> Iterator[str]:
+    """What the site has too much of, or too few."""
+    own = [path for path in (ROOT / "docs").rglob("*.md") if path.stem not in ELSEWHERE]
+    menu = re.findall(r"^ +- [^:\n]+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    counts = {"pages": len(own), "entries of the menu": len(menu)}
+    counts["words"] = sum(len(path.read_text(encoding="utf-8").split()) for path in own)
+    for (name, count), most in zip(counts.items(), (21, 25, 60_000), strict=True):
+        print(f"{count:,} {name} of at most {most:,}")
+        if count > most:
+            yield f"too many {name}"
+    bare = [page for page in menu[:6] if "![" not in (ROOT / "docs" / page).read_text(encoding="utf-8")]
+    yield from (f"{page} is one of the first six pages and has no picture" for page in bare)
+
+
 def main() -> None:
     """Print what is wrong with all pages."""
     wrong = 0
+    for excess in excesses():
+        print(excess)
+        wrong += 1
     for path in pages():
         found = list(sentences(path.read_text(encoding="utf-8")))
         for sentence in found:
