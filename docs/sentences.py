@@ -287,7 +287,7 @@ def certified() -> Sequence[str]:
     """What it says of certified models: effectivities, corrections, certificates and greedy training."""
     medians, largest, costs, corrected, *_ = page_tables("certified")
     norms = ("u in the energy norm", "u in V", "λ in the natural norm", "λ in W")
-    kinds = {"(ii)": "(ii) at high-fidelity cost", "(ii) online": "(ii) at online cost",
+    kinds = {"(ii)": "with the best correction", "(ii) online": "at online cost",
              "HSW": "Haasdonk, Salomon and Wohlmuth"}  # fmt: skip
     assert (medians["violations"] == 0).all()
     assert len(medians) == 24
