@@ -314,7 +314,8 @@ def export(
         Argument(
             metavar="[CELL] TARGET",
             help="Without the key of a CELL a new folder for all programs of the run, a test set for QP solvers; "
-            "with CELL a new file: NAME.npz for its model, NAME.c for a C program, too, or NAME.vtu for ParaView.",
+            "with CELL a new file: NAME.npz for its model, NAME.c for a C program, too, NAME.fmu for an FMU, or "
+            "NAME.vtu for ParaView.",
             autocompletion=cells,
         ),
     ],
@@ -328,16 +329,19 @@ def export(
 ) -> None:
     """Export programs, a reduced model, or a solution for ParaView.
 
-    A model is used without vibench, in Python or C; the fields for ParaView are u, λ and their errors at a parameter.
+    A model is used without vibench, in Python, C or as an FMU (FMI 2.0); the fields for ParaView are u, λ and their
+    errors at a parameter.
     """
     # The suffix tells what a cell is exported as; programs of a whole run go into a folder, which has none.
     *cell, last = words
     target, kind = Path(last), Path(last).suffix
-    if len(cell) > 1 or bool(cell) != (kind in {".npz", ".c", ".vtu"}):
-        raise RequestError("expected DIR, a folder for programs, or CELL FILE, whose name ends in .npz, .c or .vtu")
+    if len(cell) > 1 or bool(cell) != (kind in {".npz", ".c", ".fmu", ".vtu"}):
+        raise RequestError(
+            "expected DIR, a folder for programs, or CELL FILE, whose name ends in .npz, .c, .fmu or .vtu"
+        )
     others: dict[str, object] = {"--mu": mu and kind != ".vtu", "--sequence": sequence and cell}
-    if kind not in {".npz", ".c"}:
-        others |= {"--tolerance": tolerance, "--no-bases": not bases}
+    others |= {"--no-bases": not bases and kind not in {".npz", ".c"}}
+    others |= {"--tolerance": tolerance and kind not in {".npz", ".c", ".fmu"}}
     if wrong := [option for option, is_wrong in others.items() if is_wrong]:
         raise RequestError(f"{', '.join(wrong)} has no meaning for '{last}'")
     if not cell:
@@ -367,7 +371,7 @@ def _export_model(run: str, cell: str, out: Path, tolerance: float | None, bases
     from vibench.offline.polynomials import TOLERANCE
     from vibench.timing import timed
 
-    model, file = open_run(run, at=at).model(cell), out.with_suffix(".npz")
+    model, file = open_run(run, at=at).model(cell), out.with_suffix(".fmu" if out.suffix == ".fmu" else ".npz")
     made = export_model(model, file, TOLERANCE if tolerance is None else tolerance, bases=bases, c=out.suffix == ".c")
     for name, member in made.members.items():
         terms = f"{len(member.terms)} term{'s' * (len(member.terms) > 1)}"
@@ -375,7 +379,7 @@ def _export_model(run: str, cell: str, out: Path, tolerance: float | None, bases
         echo(f"{name}: {form if any(member.degrees) else 'constant'}, relative error {member.error:.1e}")
     echo("relative errors are those at random parameters and at the corners of the box")
     # The script has fewer solvers than vibench.
-    if made.about["solver"] != model.solver:
+    if made.about["solver"] != model.solver and file.suffix == ".npz":
         echo(f"the cell's solver is {model.solver}, the script solves by {made.about['solver']}")
     why = made.about["no_bounds"]
     echo(f"no error bounds: {why}" if why else f"error bounds in C: {made.about['certificate']}")
@@ -383,6 +387,9 @@ def _export_model(run: str, cell: str, out: Path, tolerance: float | None, bases
     held, others = ", ".join(output["name"] for output in outputs["linear"]), ", ".join(outputs["left_out"])
     if held or others:
         echo(f"outputs: {held or 'none'}{f'; code that the file cannot hold computes {others}' * bool(others)}")
+    if file.suffix == ".fmu":
+        echo(f"{file}: FMI 2.0, co-simulation, with its C source and its program for this platform")
+        return
     # The script and the high-fidelity model take turns, so that a change of the machine's pace concerns both.
     mus = model.parameters.sample(5, seed=0)
     calls: list[Callable[..., Any]] = [reduced_model.Model(file).solve, model.high_fidelity]

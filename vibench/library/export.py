@@ -20,7 +20,9 @@ from vibench.errors import RequestError
 from vibench.files import write_atomically, writing
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import MEMBERS, Problem
+from vibench.library.fmu import fmu
 from vibench.library.reduced_model import FORMAT, SOLVERS
+from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee, contact_unknowns, output_coefficients
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.chebyshev import AffinePolynomial
@@ -72,7 +74,7 @@ def export_model(
     model
         The model.
     file
-        Its name ends in .npz.
+        Its name ends in .npz, or in .fmu: an FMU (FMI 2.0, co-simulation) is one file with the C source and no bases.
     tolerance
         Largest relative error of the polynomials that take the place of A, f, B and g.
     evaluations
@@ -88,23 +90,28 @@ def export_model(
         If polynomials do not reach the tolerance, the model has no form of this kind, or a file exists.
     """
     file = Path(file)
-    if file.suffix != ".npz":
-        raise RequestError(f"'{file}': the model is written as an npz file, whose name must end in .npz")
+    if file.suffix not in {".npz", ".fmu"}:
+        raise RequestError(f"'{file}': the model is written as an npz file, whose name must end in .npz, or .fmu")
     if file.parent.exists() and not file.parent.is_dir():
         raise RequestError(f"'{file.parent}' is no folder")
-    sources = [file.with_suffix(".c"), file.with_suffix(".h")] if c else []
+    is_fmu = file.suffix == ".fmu"
+    sources = [file.with_suffix(".c"), file.with_suffix(".h")] if c and not is_fmu else []
     for path in (file, *sources):
         if path.exists():
             raise RequestError(f"'{path}' exists; remove it, or choose another name")
     # The script that is written beside exported files evaluates them without vibench.
     script = file.with_name("reduced_model.py")
     runtime = (files("vibench.library") / script.name).read_bytes()
-    if script.exists() and (not script.is_file() or script.read_bytes() != runtime):
+    if not is_fmu and script.exists() and (not script.is_file() or script.read_bytes() != runtime):
         raise RequestError(f"'{script}' exists and is not the runtime of this version; choose another folder")
-    found = exported(model, tolerance, evaluations, bases, c)
-    contents = {file: _npz(found), script: runtime}
-    if c:
-        texts = c_source.source(found.members, found.arrays, found.about, file.stem, found.thetas, found.exact)
+    found = exported(model, tolerance, evaluations, bases and not is_fmu, c or is_fmu)
+    given = found.arrays, found.about, file.stem
+    texts = list(c_source.source(found.members, *given, found.thetas, found.exact) if c or is_fmu else ())
+    if is_fmu:
+        # The modes stand in the order of the numbers that the certificate in C takes.
+        contents = {file: fmu(texts[0], *given, [*CorrectionMode].index(model.correction))}
+    else:
+        contents = {file: _npz(found), script: runtime}
         contents |= {path: text.encode() for path, text in zip(sources, texts, strict=True)}
     # All contents are computed before the first is written: a failure leaves no file.
     with writing(file):

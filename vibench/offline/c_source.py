@@ -73,7 +73,7 @@ def source(
     """The C source of a model whose basis does not depend on the parameter, and its header."""
     # The names of its functions begin with `stem`. With the `thetas` of a certificate it has error bounds. Members that
     # are `exact` take the place of polynomials with their names.
-    name = re.sub(r"\W", "_", f"model_{stem}" if not stem[:1].isalpha() else stem, flags=re.ASCII)
+    name = identifier(stem)
     box, cell, polynomials = about["parameters"], about["cell"], {**members, **thetas}
     own = {key: exact.get(key, polynomial) for key, polynomial in polynomials.items()}
     parameters, sets, factor = (arrays.get(f"start_{name}", np.zeros(0)) for name in ("parameters", "sets", "factor"))
@@ -94,7 +94,7 @@ def source(
     }  # fmt: skip
     # A function that nothing calls would be a warning of the compiler.
     some = any(isinstance(one, AffinePolynomial) for one in own.values())
-    values["products"] = _filled("reduced_model_products.c", {}) if some else ""
+    values["products"] = filled("reduced_model_products.c", {}) if some else ""
     parts: list[str] = []
     values["output_count"] = len(arrays.get("outputs_x", ()))
     if "outputs_x" in arrays:
@@ -106,12 +106,18 @@ def source(
         values |= _certified({key: own[key] for key in thetas}, arrays) | {"guarantee": about["certificate"]}
         parts += ["certificate", "certified_outputs"] if parts else ["certificate"]
     for kind, name in (("h", "declarations"), ("c", "code")):
-        values[name] = "".join(_filled(f"reduced_model_{part}.{kind}", values) for part in parts)
-    header = _filled("reduced_model.h", values)
-    return _filled("reduced_model.c", values | {"header": header}), header
+        values[name] = "".join(filled(f"reduced_model_{part}.{kind}", values) for part in parts)
+    header = filled("reduced_model.h", values)
+    return filled("reduced_model.c", values | {"header": header}), header
 
 
-def _filled(template: str, values: Mapping[str, Any]) -> str:
+def identifier(stem: str) -> str:
+    """The name in C of a model whose file has this stem."""
+    return re.sub(r"\W", "_", f"model_{stem}" if not stem[:1].isalpha() else stem, flags=re.ASCII)
+
+
+def filled(template: str, values: Mapping[str, Any]) -> str:
+    """A template of this folder with its values."""
     text = (files("vibench.offline") / "templates" / f"{template}.template").read_text(encoding="utf-8")
     return Template(text).substitute(values)
 

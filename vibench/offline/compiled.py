@@ -108,7 +108,7 @@ class CompiledProgram:
     def __init__(self, source: str, unknowns: int, constraints: int) -> None:
         # A library that is loaded needs its file no longer.
         with foreign("the C compiler, or what it makes,"), scratch() as folder:
-            self._solve = ctypes.CDLL(str(_compiled(source, folder))).model_solve_counting
+            self._solve = ctypes.CDLL(str(compiled(source, folder))).model_solve_counting
         self._sizes = unknowns, constraints
         self._solve.argtypes, self._solve.restype = [ctypes.c_void_p] * 5, ctypes.c_int
 
@@ -139,12 +139,13 @@ def compiler() -> list[str]:
     raise UnsupportedError(f"there is no C compiler: none of {', '.join(usual)} is on the PATH; {advice}")
 
 
-def _compiled(source: str, folder: Path) -> Path:
+def compiled(source: str, folder: Path, native: bool = True) -> Path:
+    """The shared library of a source, compiled in a folder; if `native`, for this processor."""
     command, library = compiler(), folder / "model.so"
     (folder / "model.c").write_text(source, encoding="utf-8")
-    # For this processor, which changes no result: no option reorders or contracts sums. Some compilers do not know it.
-    for native in (["-march=native"], []):
-        options = ["-std=c99", "-O3", *native, "-ffp-contract=off", "-shared", "-fPIC"]
+    # The processor changes no result: no option reorders or contracts sums. Some compilers do not know this one.
+    for processor in (["-march=native"], []) if native else ([],):
+        options = ["-std=c99", "-O3", *processor, "-ffp-contract=off", "-shared", "-fPIC"]
         ended = subprocess.run(
             [*command, *options, "model.c", "-o", library.name, "-lm"],
             cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", check=False,
