@@ -208,7 +208,7 @@ class _Command(typer.core.TyperCommand):
 for _name, _call in dict[str, Callable[..., None]](
     run=run_study_command, list=plugins.list_plugins, show=results.show, report=results.write_report,
     figures=results.draw_figures, compare=results.compare_runs, replay=results.replay_query, export=results.export,
-    pack=pack, check=plugins.check_plugin, new=plugins.new_plugin, bench=plugins.bench_plugins,
+    serve=results.serve, pack=pack, check=plugins.check_plugin, new=plugins.new_plugin, bench=plugins.bench_plugins,
     publish=results.publish_runs, clean=clean, doctor=doctor, help=help_on,
 ).items():  # fmt: skip
     # Without an own default map a command would take the default above of an option of the same name for its own.

@@ -340,8 +340,8 @@ def export(
             "expected DIR, a folder for programs, or CELL FILE, whose name ends in .npz, .c, .fmu or .vtu"
         )
     others: dict[str, object] = {"--mu": mu and kind != ".vtu", "--sequence": sequence and cell}
-    others |= {"--no-bases": not bases and kind not in {".npz", ".c"}}
     others |= {"--tolerance": tolerance and kind not in {".npz", ".c", ".fmu"}}
+    others |= {"--no-bases": not bases and kind not in {".npz", ".c"}}
     if wrong := [option for option, is_wrong in others.items() if is_wrong]:
         raise RequestError(f"{', '.join(wrong)} has no meaning for '{last}'")
     if not cell:
@@ -400,3 +400,29 @@ def _export_model(run: str, cell: str, out: Path, tolerance: float | None, bases
     sources = [file.with_suffix(end) for end in (".c", ".h") if out.suffix == ".c"]
     written = ", ".join(map(str, [file, file.with_name("reduced_model.py"), *sources]))
     echo(f"{written}: `from reduced_model import Model`, then `Model({str(file)!r}).solve(mu)`")
+
+
+def serve(
+    run: RunArgument,
+    cell: Annotated[str, Argument(metavar="CELL", help="Key of a cell, or its beginning.", autocompletion=cells)],
+    host: Annotated[
+        str, Option(metavar="ADDRESS", help="Address to listen at: 0.0.0.0 lets other machines ask.")
+    ] = "127.0.0.1",
+    port: Annotated[int | None, Option(min=0, max=65535, help="Port; 4242 by default, 0 is a free one.")] = None,
+    at: At = None,
+) -> None:
+    """Serve a model to clients of UM-Bridge, until Ctrl-C or the end of what has started the command.
+
+    An answer has the outputs of the problem, and as a second vector bounds of their errors if the model has any.
+    """
+    from vibench.library.runs import open_run
+    from vibench.library.serving import ModelServer
+
+    model = open_run(run, at=places_of(at)).model(cell)
+    # The port of UM-Bridge.
+    with ModelServer(model, host, 4242 if port is None else port) as server:
+        given, outputs = (", ".join(names) for names in (model.parameters.names, server.outputs))
+        worth = "no bounds" if model.certificate is None else f"{model.certificate.base.guarantee.value} bounds"
+        url = f"http://{host}:{server.server_address[1]}"
+        echo(f"({given}) to ({outputs}), {worth}: `umbridge.HTTPModel('{url}', {server.name!r})`")
+        server.serve()
