@@ -92,10 +92,10 @@ def importable(package: Path, register: Register, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.usefixtures("importable")
-def test_the_membrane_of_fenicsx_is_a_problem() -> None:
-    pytest.importorskip("dolfinx", reason="FEniCSx is not installed: its example is not run")
-    membrane = importlib.import_module("vibench_mine.membrane_dolfinx").Membrane
-    check(partial(membrane, cells=8))
+@pytest.mark.parametrize(("code", "size"), [("dolfinx", {"cells": 8}), ("ngsolve", {"size": 0.15})])
+def test_the_membrane_of_another_code_is_a_problem(code: str, size: dict[str, Any]) -> None:
+    pytest.importorskip(code, reason=f"{code} is not installed: its example is not run")
+    check(partial(importlib.import_module(f"vibench_mine.membrane_{code}").Membrane, **size))
 
 
 def test_the_plugins_of_the_pages_run_through_a_benchmark(package: Path, vibench: Vibench, tmp_path: Path) -> None:
