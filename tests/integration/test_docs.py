@@ -20,6 +20,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 from running import Main, Register, Vibench, rows, succeeded
@@ -96,6 +97,33 @@ def importable(package: Path, register: Register, monkeypatch: pytest.MonkeyPatc
 def test_the_membrane_of_another_code_is_a_problem(code: str, size: dict[str, Any]) -> None:
     pytest.importorskip(code, reason=f"{code} is not installed: its example is not run")
     check(partial(importlib.import_module(f"vibench_mine.membrane_{code}").Membrane, **size))
+
+
+@pytest.mark.usefixtures("importable")
+def test_kratos_gives_its_matrices() -> None:
+    pytest.importorskip("KratosMultiphysics.ConvectionDiffusionApplication", reason="Kratos is not installed")
+    import KratosMultiphysics as Kratos  # noqa: PLC0415  where it is installed
+
+    model, settings = Kratos.Model(), Kratos.ConvectionDiffusionSettings()
+    part = model.CreateModelPart("membrane")
+    settings.SetUnknownVariable(Kratos.TEMPERATURE)
+    settings.SetDiffusionVariable(Kratos.CONDUCTIVITY)
+    settings.SetVolumeSourceVariable(Kratos.HEAT_FLUX)
+    part.ProcessInfo.SetValue(Kratos.CONVECTION_DIFFUSION_SETTINGS, settings)
+    for variable in (Kratos.TEMPERATURE, Kratos.CONDUCTIVITY, Kratos.HEAT_FLUX):
+        part.AddNodalSolutionStepVariable(variable)
+    for number, place in enumerate([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], start=1):
+        node = part.CreateNewNode(number, *place, 0.0)
+        node.SetSolutionStepValue(Kratos.CONDUCTIVITY, 1.0)
+        node.SetSolutionStepValue(Kratos.HEAT_FLUX, 6.0)
+        node.AddDof(Kratos.TEMPERATURE)
+    for number, corners in enumerate([[1, 2, 3], [1, 3, 4]], start=1):
+        part.CreateNewElement("LaplacianElement2D3N", number, corners, part.CreateNewProperties(number))
+    A, f = importlib.import_module("vibench_mine.kratos_matrices").assembled(part)
+    assert np.allclose(
+        A.toarray(), np.eye(4) - 0.5 * np.roll(np.eye(4), 1, axis=0) - 0.5 * np.roll(np.eye(4), -1, axis=0)
+    )
+    assert np.allclose(f, [2.0, 1.0, 2.0, 1.0])
 
 
 def test_the_plugins_of_the_pages_run_through_a_benchmark(package: Path, vibench: Vibench, tmp_path: Path) -> None:
