@@ -411,9 +411,10 @@ def serve(
     port: Annotated[int | None, Option(min=0, max=65535, help="Port; 4242 by default, 0 is a free one.")] = None,
     at: At = None,
 ) -> None:
-    """Serve a model to clients of UM-Bridge, until Ctrl-C or the end of what has started the command.
+    """Serve a reduced model to clients of UM-Bridge.
 
-    An answer has the outputs of the problem, and as a second vector bounds of their errors if the model has any.
+    An answer has the outputs of the problem, and as a second vector bounds of their errors if the model has any. It
+    ends with Ctrl-C, or with the process that has started it.
     """
     from vibench.library.runs import open_run
     from vibench.library.serving import ModelServer

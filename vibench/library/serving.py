@@ -31,11 +31,10 @@ class ModelServer(ThreadingTCPServer):
         if not self.outputs:
             raise RequestError("the problem has no outputs, with which a server would answer")
         sizes = [len(self.outputs)] * (1 if model.certificate is None else 2)
-        unable = dict.fromkeys(("Gradient", "ApplyJacobian", "ApplyHessian"), False)
+        able = {"Evaluate": True, "Gradient": False, "ApplyJacobian": False, "ApplyHessian": False}
         self.fixed: dict[str, dict[str, Any]] = {
-            "GET /Info": {"protocolVersion": 1.0, "models": [self.name]}, "POST /OutputSizes": {"outputSizes": sizes},
-            "POST /InputSizes": {"inputSizes": [model.parameters.dim]},
-            "POST /ModelInfo": {"support": {"Evaluate": True, **unable}},
+            "GET /Info": {"protocolVersion": 1.0, "models": [self.name]}, "POST /ModelInfo": {"support": able},
+            "POST /InputSizes": {"inputSizes": [model.parameters.dim]}, "POST /OutputSizes": {"outputSizes": sizes},
         }  # fmt: skip
         try:
             super().__init__((host, port), _Request)
@@ -72,10 +71,13 @@ class _Request(BaseHTTPRequestHandler):
 
     server: ModelServer
 
+    def setup(self) -> None:
+        # A client that says nothing for a minute has no thread any longer.
+        self.request.settimeout(60.0)
+        super().setup()
+
     def do_GET(self) -> None:
         server, call = self.server, f"{self.command} {self.path}"
-        # A client that says nothing for a minute has no thread any longer.
-        self.connection.settimeout(60.0)
         try:
             asked = self._asked() if self.command == "POST" else {"name": server.name}
             if asked.get("name") != server.name:
@@ -92,8 +94,7 @@ class _Request(BaseHTTPRequestHandler):
         except VibenchError as error:
             self.send_error(500, str(error), "InvalidOutput")
 
-    def do_POST(self) -> None:
-        self.do_GET()
+    do_POST = do_GET  # noqa: N815  the name that the base class looks for
 
     def _asked(self) -> dict[str, Any]:
         """The object in the body."""
