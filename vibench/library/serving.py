@@ -30,6 +30,8 @@ class ModelServer(ThreadingTCPServer):
         self.name = str(model.row.get("problem") or type(model.problem).__name__)
         if not self.outputs:
             raise RequestError("the problem has no outputs, with which a server would answer")
+        # Taken before anybody is told of the server, who may end.
+        self.timeout, self._parent = 0.5, os.getppid()
         sizes = [len(self.outputs)] * (1 if model.certificate is None else 2)
         able = {"Evaluate": True, "Gradient": False, "ApplyJacobian": False, "ApplyHessian": False}
         self.fixed: dict[str, dict[str, Any]] = {
@@ -43,8 +45,7 @@ class ModelServer(ThreadingTCPServer):
 
     def serve(self) -> None:
         """Answer requests while the parent of this process lives, for which it looks twice a second."""
-        self.timeout, parent = 0.5, os.getppid()
-        while os.getppid() == parent:
+        while os.getppid() == self._parent:
             self.handle_request()
 
     def evaluate(self, given: Any) -> list[list[float]]:

@@ -484,6 +484,7 @@ def test_exported_members_and_their_certificate(run: vibench.Run) -> None:
 
 def test_the_code_of_the_page_runs(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     export_model(certified_model(run), tmp_path / "membrane.npz")
+    export_model(certified_model(run, "obstacle"), tmp_path / "membrane.fmu")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     page = (Path(__file__).parents[3] / "docs" / "export.md").read_text(encoding="utf-8")
