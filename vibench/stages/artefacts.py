@@ -82,11 +82,12 @@ def loads(content: bytes) -> Any:
 
 
 class _Writer:
-    """Describes a value in JSON; arrays are stored apart, and one that occurs twice is stored once."""
+    """Describes a value in JSON; arrays are stored apart, and what occurs twice, if only as a copy, is stored once."""
 
     def __init__(self) -> None:
         self.arrays: dict[str, np.ndarray[Any, Any]] = {}
-        self._numbers: dict[int, str] = {}
+        # Numbers of arrays by their identity, or by type, shape and digest of their content.
+        self._numbers: dict[object, str] = {}
         # Keep described objects alive: identities of collected ones are reused.
         self._alive: list[Any] = []
 
@@ -105,24 +106,29 @@ class _Writer:
             return {type(value).__name__: [self.described(part) for part in value]}
         return self._array(value) if type(value) is np.ndarray or isinstance(value, np.generic) else self._object(value)
 
-    def _array(self, value: Any) -> Any:
-        """An array, or a number of NumPy."""
+    def _array(self, value: Any, *, alone: bool = False) -> Any:
+        """An array, or a number of NumPy; one that is `alone` shares its memory with no copy when it is read."""
         # Booleans, signed and unsigned integers and floats of at most 8 bytes: safetensors has no other type.
         if value.dtype.kind not in "biuf" or value.dtype.itemsize > 8:
             raise NumericalError(f"an array of the type {value.dtype} cannot be stored")
         columnwise = value.flags.f_contiguous and not value.flags.c_contiguous
         kind = "scalar" if isinstance(value, np.generic) else "columnwise" if columnwise else "array"
         if id(value) not in self._numbers:
-            number = self._numbers[id(value)] = str(len(self.arrays))
+            stored = value.T if columnwise else np.asarray(value, order="C")
+            digest = b"" if alone else hashlib.sha256(stored.data).digest()
+            content = (value.dtype.str, stored.shape, digest) if digest else id(value)
+            number = self._numbers.setdefault(content, str(len(self.arrays)))
+            self._numbers[id(value)] = number
             self._alive.append(value)
-            self.arrays[number] = value.T if columnwise else np.asarray(value, order="C")
+            self.arrays.setdefault(number, stored)
         return {kind: self._numbers[id(value)]}
 
     def _sparse(self, value: SparseMatrix) -> Any:
         kind = value.format if value.format in SPARSE else "coo"
         stored = value.asformat(kind)
         self._alive.append(stored)
-        parts = [self.described(np.asarray(getattr(stored, name))) for name in SPARSE[kind]]
+        # SciPy sorts the arrays of a matrix in place.
+        parts = [self._array(np.asarray(getattr(stored, name)), alone=True) for name in SPARSE[kind]]
         return {"sparse": [value.format, kind, isinstance(value, sp.sparray), list(value.shape), parts]}
 
     def _object(self, value: Any) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,6 +52,8 @@ class ReducedPrograms:
     errors: tuple[float, ...]
     # The Galerkin projections solved to round-off, or `None` where that fails; empty for full assembly.
     projected: tuple[ExactSolution | None, ...] = ()
+    # Number of vectors of programs that are the leading parts of nested ones: they are not stored twice.
+    size: int | None = None
 
 
 @dataclass(frozen=True)
@@ -80,11 +82,21 @@ class AssemblyStage(Stage):
         larger = value_of(store, self.nested) if self.nested is not None and is_own else None
         if isinstance(reduced, HyperReducedModel):
             return Result(_reduced(reduced, mus, larger))
-        if larger is None:
-            programs = _projections(reduced, mus)
-        else:
-            programs = [leading_part(program, reduced.fixed_basis.shape[1]) for program in larger]
-        return Result(ReducedPrograms(tuple(programs), None, (0.0,) * len(mus)))
+        if larger is not None:
+            return Result(ReducedPrograms((), None, (0.0,) * len(mus), size=reduced.fixed_basis.shape[1]))
+        return Result(ReducedPrograms(tuple(_projections(reduced, mus)), None, (0.0,) * len(mus)))
+
+    @property
+    def stored_in(self) -> tuple[Stage, ...]:
+        """The stages whose artefacts `programs` reads."""
+        return (self,) if self.nested is None else (self, self.nested)
+
+    def programs(self, store: Store) -> ReducedPrograms:
+        """The value with its programs, once the stages in `stored_in` have been run."""
+        stored: ReducedPrograms = value_of(store, self)
+        if (size := stored.size) is None or self.nested is None:
+            return stored
+        return replace(stored, programs=tuple(leading_part(one, size) for one in value_of(store, self.nested)))
 
     def columns(self, store: Store) -> dict[str, float | int | None]:
         """Columns of a cell: tolerance, training error and terms of every member; none for assembly in full."""
@@ -137,6 +149,9 @@ class ExactSolutions(Stage):
 
     assembly: AssemblyStage
 
+    def inputs(self) -> tuple[Stage, ...]:
+        return self.assembly.stored_in
+
     def run(self, store: Store) -> Result:
         """One `ExactSolution` per validation parameter, or `None`."""
-        return Result(tuple(exact_solution(program) for program in value_of(store, self.assembly).programs))
+        return Result(tuple(map(exact_solution, self.assembly.programs(store).programs)))

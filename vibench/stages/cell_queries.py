@@ -153,7 +153,7 @@ class CellQueries(ItemwiseStage):
     @property
     def model_inputs(self) -> tuple[Stage, ...]:
         """The stages of the model, its programs and its certificate, which are all that a timed query reads."""
-        assembly = () if self.assembly is None else (self.assembly,)
+        assembly = () if self.assembly is None else self.assembly.stored_in
         certifying = () if self.certificate is None else (self.certificate.base, self.certificate)
         return (*self.built.model_inputs, *assembly, *certifying)
 

@@ -24,7 +24,7 @@ from vibench.qp.verification import RECOGNISED, QPSolution, check_answer, slack,
 from vibench.results.consistency import solution_row
 from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage, ReducedPrograms
-from vibench.stages.base import Row, TimeLimit, value_of
+from vibench.stages.base import Row, TimeLimit
 from vibench.stages.formulation import FormulationStage
 from vibench.study.parameter_sets import ParameterSet
 from vibench.timing import SLOW, Seconds, timed
@@ -175,7 +175,7 @@ class Queries:
     ) -> None:  # fmt: skip
         self.model, self._validation = built.model(store, accuracy=accuracy), validation
         self.mus = validation.of(self.model.problem)
-        self.programs: ReducedPrograms | None = None if assembly is None else value_of(store, assembly)
+        self.programs: ReducedPrograms | None = None if assembly is None else assembly.programs(store)
 
     @cached_property
     def _before(self) -> list[int | None]:

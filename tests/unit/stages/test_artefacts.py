@@ -68,6 +68,22 @@ def test_what_is_put_is_got_by_another_process(tmp_path: Path, monkeypatch: pyte
     assert files(folder) == ["key.artefact"]
 
 
+def test_copies_are_stored_once_but_not_those_that_scipy_sorts() -> None:
+    one, zero = np.random.default_rng(0).random((40, 50)), -np.zeros((40, 50))
+    matrix = sp.csr_array(one)
+    alone, value = (
+        len(dumps(one)),
+        [one, one.copy(), one.T.copy().T, zero, zero.copy(), np.empty((0, 3)), np.float64(1)],
+    )
+    assert len(dumps(value)) < 3 * alone + 2000
+    found = loads(dumps(value))
+    assert all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in zip(found, value, strict=True))
+    assert found[0] is found[1]
+    assert np.signbit(found[4]).all()
+    again, other = loads(dumps([matrix, matrix.copy()]))
+    assert not np.shares_memory(again.indices, other.indices)
+
+
 def test_artefacts_are_whole_or_earlier_ones_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(NumericalError, match=r"type builtins\.function cannot be stored"):
         Store(tmp_path).put("key", lambda: 0, TIME, ())
