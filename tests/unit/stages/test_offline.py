@@ -130,7 +130,7 @@ def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(store: SampleStore,
     for quantity, values in histories[0].items():
         assert histories[1][quantity] == pytest.approx(values, rel=1e-9), quantity
     if interpolation is None:
-        programs = [value_of(store, c.assembly).programs for c in (alone, grown)]
+        programs = [c.assembly.programs(store).programs for c in (alone, grown)]
         for one, other in zip(*programs, strict=True):
             assert np.allclose(one.A, other.A, rtol=1e-10, atol=1e-13)
             assert np.allclose(one.B, other.B, rtol=1e-10, atol=1e-13)
