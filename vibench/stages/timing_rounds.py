@@ -183,7 +183,7 @@ class _Rounds(Items):
                 # The assembly is part of the solution.
                 assemble[k] = NO_TIME
             else:
-                # Seeds below 5 are those of queries and of the at most three solutions.
+                # Seeds below 5 are those of queries and of the at most two solutions.
                 further = partial(self._beside.marginal.assemble, k, at, cell, 5 + warm_up)
                 seconds = _assembly(queries.model.reduced, near, solution, further, assemble)
                 assemble |= {} if seconds is None else {k: seconds}
