@@ -232,7 +232,7 @@ class CondensedStiffness(Inverse):
             solve_active = ComplianceSolver(self._blocks, self._last[1], B, vi.g)
         else:
             # A larger border takes longer than another factorisation.
-            solve_active = SaddlePointSolver(condensed.schur, load, B, vi.g, 16, whole)
+            solve_active = SaddlePointSolver(self._A if whole else condensed.schur, load, B, vi.g, 16, whole)
             self._saddle = solve_active if whole else None
         recover = partial(condensed.recover, particular=particular)
         return ActiveSetSystem(B, vi.g, solve_active, recover, condensed.correct_eliminated)

@@ -113,11 +113,14 @@ class StaticCondensation:
         self._pattern, self._size = pattern, A.shape[0]
         A, count = sp.csr_array(A), len(pattern.interface)
         natural = np.arange(len(pattern.order))
-        eliminate, (factorised, retained) = implementation(factorisation).eliminate, pattern.blocks
-        self._factor = eliminate(factorised.of(A).T, natural, count, "A") if len(natural) else None
+        eliminate, self._A = implementation(factorisation).eliminate, A
+        self._factor = eliminate(pattern.blocks[0].of(A).T, natural, count, "A") if len(natural) else None
         self.dense = pattern.is_dense
-        self._retained_block = retained.of(A)
         self._last_load: tuple[Array, tuple[Array, Array]] | None = None
+
+    @cached_property
+    def _retained_block(self) -> SparseMatrix:
+        return self._pattern.blocks[1].of(self._A)
 
     @property
     def nbytes(self) -> int:

@@ -81,7 +81,7 @@ class Directions:
     side: Array
 
     @classmethod
-    def of(cls, B: SparseMatrix, present: Mask) -> Directions:
+    def of(cls, B: SparseMatrix | Array, present: Mask) -> Directions:
         """Find parallel rows of B (m×n) among those that are `present` (m,)."""
         lengths = row_norms(B)
         # Parallel rows of length 1 have the same product with a random vector but for round-off, which few others have.
@@ -109,8 +109,9 @@ def _probe(count: int) -> Array:
 
 
 def rows_that_matter(
-    B: SparseMatrix, g: Array, room: Array, preferred: Array | None = None, directions: Directions | None = None
-) -> Rows:
+    B: SparseMatrix | Array, g: Array, room: Array, preferred: Array | None = None,
+    directions: Directions | None = None,
+) -> Rows:  # fmt: skip
     """Find the rows of B (m×n) and g (m,) that matter: the tightest of parallel ones, one equality for opposite ones.
 
     Absent rows, and zero ones that hold, do not matter.
@@ -122,7 +123,7 @@ def rows_that_matter(
     dropped, equal, opposite, ratio = is_absent(g), np.zeros(m, bool), np.arange(m), np.ones(m)
     dropped |= zero_rows(B) & (g >= 0.0)
     implied = dropped.copy()
-    directions = directions or Directions.of(sp.csr_array(B), ~dropped)
+    directions = directions or Directions.of(B, ~dropped)
     if not len(directions.members):
         kept = np.flatnonzero(~dropped)
         return Rows(kept, equal[kept], kept, ratio[kept], implied)

@@ -124,7 +124,7 @@ def kkt_residuals(
     # One solve for all costs the least.
     lengths = inverse.dual_norms(np.column_stack([_dense_rows(B, violated).T, force, residual]))
     step, left, contact = _largest_step(excess[violated], lengths[:-2]), float(lengths[-1]), float(lengths[-2])
-    rows = rows_that_matter(sp.csr_array(B), g, rounded)
+    rows = rows_that_matter(B, g, rounded)
     if len(rows.equalities):
         held = inverse.holding(replace(program, f=force, g=np.zeros_like(g)), rows.equalities)
         contact = _energy(program.A, held)
