@@ -71,9 +71,10 @@ def test_solutions_are_nearer_than_any_solver_s_and_may_have_many_multipliers() 
     assert exact_solution(empty).alpha.tolist() == [0.0, 0.0]
 
 
-def test_of_parallel_rows_the_tightest_is_kept_and_rows_that_differ_are_all() -> None:
+@pytest.mark.parametrize("stored", [sp.csr_array, np.array])
+def test_of_parallel_rows_the_tightest_is_kept_and_rows_that_differ_are_all(stored: type) -> None:
     lines = "1 2 0; -2 -4 0; 0 0 1; 0 0 -3; 1 0 0; 5 0 0; 0 1e-9 0; 0 0 0; 0.1 0.2 0; 0 0 7; -1 1 1"
-    B = sp.csr_array([[float(entry) for entry in line.split()] for line in lines.split(";")])
+    B = stored([[float(entry) for entry in line.split()] for line in lines.split(";")])
     g = np.array([1.0, -2.0, 5.0, 1.0, 2.0, 3.0, np.inf, 1.0, 0.1, 35.0, 0.0])
     rows = rows_that_matter(B, g, 1e-12 * np.abs(g), preferred=np.zeros(11))
     assert rows.kept.tolist() in ([0, 2, 3, 5, 10], [0, 3, 5, 9, 10])
@@ -90,7 +91,7 @@ def test_of_parallel_rows_the_tightest_is_kept_and_rows_that_differ_are_all() ->
     B = np.random.default_rng(0).standard_normal((4, 6))
     B[1] = B[0] * (1.0 + 1e-9 * np.arange(6))
     B[2] = -B[0] * (1.0 - 1e-9 * np.arange(6))
-    rows = rows_that_matter(sp.csr_array(B), np.zeros(4), np.ones(4))
+    rows = rows_that_matter(stored(B), np.zeros(4), np.ones(4))
     assert rows.kept.tolist() == [0, 1, 2, 3]
     assert not rows.equal.any()
 
