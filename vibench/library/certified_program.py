@@ -27,7 +27,11 @@ class CertifiedProgram:
     """
 
     def __init__(self, model: Model, names: tuple[str, ...]) -> None:
-        self._problem, self._base = model.problem, BoundedSensors(model, names).base
+        bounded = BoundedSensors(model, names)
+        self._problem, self._base = model.problem, bounded.base
+        # Known before polynomials are computed, which may take long.
+        if self._base.bound_terms is None or bounded.certificate.prepared is None:
+            raise UnsupportedError("the C program has no bounds: B and g are no declared sums, or B has several terms")
         found = exported(model, bases=False, c=True)
         if why := found.about["no_bounds"]:
             raise UnsupportedError(f"the C program of the model has no bounds: {why}")

@@ -28,6 +28,7 @@ from vibench.offline.reduction import Reduction
 from vibench.plugins.plugin import Plugin
 from vibench.reduction.pod import POD
 from vibench.reduction.supremizers import ContactCoordinates, LoadCoordinates, SpannedCoordinates
+from vibench.stability.coercivity import Constant
 from vibench.stages.artefacts import Store, storable
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.enrichment import EnrichmentStage
@@ -41,7 +42,7 @@ storable(
     SpannedCoordinates, InnerProduct, SparseCholesky, PartialCholesky, BlockDiagonal,
     # Formulations may build steps of other offline phases, and compiled programs.
     POD, Cone, Kind, Enrichment, CompiledModel, AffinePolynomial,
-    CertificateBase, ContactCompliance, OnlineInfSup, PreparedCorrections, ResidualBasis, SpectralBounds,
+    CertificateBase, Constant, ContactCompliance, OnlineInfSup, PreparedCorrections, ResidualBasis, SpectralBounds,
     AnchorGrid, TermRanges,
 )  # fmt: skip
 
