@@ -124,12 +124,12 @@ def write_page(folder: Path, table: pd.DataFrame) -> None:
     lines = [
         "# Calibration: chains compared state by state", "",
         "    python results/scripts/calibration.py results/calibration", "",
-        f"Metropolis chains of {STEPS} steps, the first {BURN_IN} of which adapt, on problems of the paper at its size.",
+        f"Metropolis chains of {STEPS} steps, the first {BURN_IN} of which adapt, on problems at the paper's size.",
         "The data are synthetic, at (1.05, 0.01, −0.02) of the obstacle and at the radius 1.03 of Hertz.", "",
         "The states of the chains whose decisions the high-fidelity model takes are in",
         f"{', '.join(f'[{name}]({name})' for name in files)}. [The table](chains.csv) has a column for each row below.",
         "Seconds are CPU seconds on a machine with other load. Proposals outside the box are no decisions.", "",
-        shown.to_markdown(headers=[]), "",
+        shown.iloc[1:].to_markdown(headers=["problem", *shown.iloc[0]]), "",
     ]  # fmt: skip
     (folder / "README.md").write_text("\n".join(lines), encoding="utf-8")
 

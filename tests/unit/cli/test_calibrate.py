@@ -91,7 +91,7 @@ RIGHT: dict[str, Any] = {"value": -0.07, "noise": 0.001}
 @pytest.mark.parametrize(
     ("sensors", "rest", "said"),
     [
-        ({"outer": RIGHT}, "", "no output of the problem is called 'outer'; did you mean 'outer deflection'?"),
+        ({"outer": RIGHT}, "", "no output of the problem is called 'outer' (known: inner deflection"),
         ({OUTER: {**RIGHT, "unit": "mm"}}, "", f"sensors.{OUTER}.unit is 'mm', the output has 'm'"),
         ({OUTER: {"value": 1.0}}, "", f"sensors.{OUTER}.noise: required, but not given"),
         ({OUTER: {"value": 0.0, "noise": "1%"}}, "", "is a share of the value 0"),
