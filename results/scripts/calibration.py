@@ -17,13 +17,13 @@ from time import process_time
 
 import numpy as np
 import pandas as pd
+from vibench.library.certified_program import CertifiedProgram
 
 import vibench
 from vibench.calibration.data import Data, Prior
 from vibench.calibration.decisions import BoundedSensors, Decisions, Sensors
 from vibench.calibration.metropolis import Metropolis
 from vibench.errors import UnsupportedError
-from vibench.library.certified_program import CertifiedProgram
 
 STEPS, BURN_IN, SEED, NOISES = 5000, 1000, 2022, (0.03, 0.01, 0.003)
 PROBLEMS = {"obstacle": (1.05, 0.01, -0.02), "hertz": (1.03,)}

@@ -9,5 +9,5 @@ from .decisions import Interval as Interval
 from .decisions import Prediction as Prediction
 from .decisions import RefutedError as RefutedError
 from .metropolis import Metropolis as Metropolis
-from .posterior import summary as summary
+from .metropolis import summary as summary
 from .ranked import minimise as minimise

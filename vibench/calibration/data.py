@@ -29,8 +29,6 @@ class _Table(BaseModel):
 
 
 class _Sensor(_Table):
-    """A measured value, its unit, and the standard deviation of its noise, or this as "1 %" of the value."""
-
     value: FiniteFloat
     noise: Deviation | str | None = None
     unit: str | None = None
@@ -42,8 +40,6 @@ class _Normal(_Table):
 
 
 class _File(_Table):
-    """A file of data; the covariance takes the place of the noise of its sensors, in their order."""
-
     sensors: Annotated[dict[str, _Sensor], Field(min_length=1)]
     covariance: list[list[FiniteFloat]] | None = None
     prior: dict[str, _Normal] = {}
@@ -61,12 +57,7 @@ class Data:
     values
         d (k,), in the units of the outputs.
     covariance
-        That of the noise (k×k), symmetric positive definite.
-
-    Raises
-    ------
-    RequestError
-        If the covariance is no such matrix.
+        That of the noise (k×k); a `RequestError` if it is not symmetric positive definite.
     """
 
     sensors: Annotated[tuple[str, ...], "k"]
@@ -88,11 +79,6 @@ class Data:
         """Data whose errors are independent, with the standard deviations `noise` (k,)."""
         return cls(tuple(sensors), np.asarray(values, float), np.diag(np.asarray(noise, float) ** 2))
 
-    @property
-    def noise(self) -> Array:
-        """Standard deviations (k,)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
-
     def misfit(self, outputs: Array) -> float:
         """½ (s − d)ᵀ C⁻¹ (s − d) of outputs s (k,): the negative logarithm of the likelihood, up to a constant."""
         return self.interval(outputs, np.zeros(len(outputs)))[0]
@@ -110,10 +96,7 @@ class Data:
 
 @dataclass(frozen=True)
 class Prior:
-    """The prior on a parameter box: uniform, or normal in some components and truncated to the box.
-
-    Means (d,) and standard deviations (d,), which are infinite where it is uniform.
-    """
+    """The prior on a parameter box: normal and truncated to the box, uniform where the deviation `sd` is infinite."""
 
     box: ParameterBox
     mean: Array
@@ -134,11 +117,6 @@ class Prior:
             return -np.inf
         return -0.5 * float(np.sum(((mu - self.mean) / self.sd) ** 2))
 
-    @property
-    def start(self) -> Array:
-        """The mean (d,), moved into the box."""
-        return np.clip(self.mean, self.box.lower, self.box.upper)
-
 
 def read_data(path: Path, problem: Problem) -> tuple[Data, Prior]:
     """The data and the prior of a TOML file; a `RequestError` names the file, the key and what would be right."""
@@ -148,63 +126,65 @@ def read_data(path: Path, problem: Problem) -> tuple[Data, Prior]:
             file = _File.model_validate(content)
         except ValidationError as fault:
             raise RequestError(fault_line(fault, _File)) from None
-        known = {output.name: output for output in problem.outputs}
+        known, values = {output.name: output for output in problem.outputs}, []
         for name, sensor in file.sensors.items():
             if name not in known:
                 raise unknown_name("output of the problem", name, known)
             if sensor.unit not in (None, known[name].unit):
                 raise RequestError(f"sensors.{name}.unit is '{sensor.unit}', the output has '{known[name].unit}'")
-        values = np.array([sensor.value for sensor in file.sensors.values()])
+            values.append(sensor.value)
         prior = Prior.of(problem.parameters, {name: (one.mean, one.sd) for name, one in file.prior.items()})
         if file.covariance is None:
             noise = np.array([_deviation(name, sensor) for name, sensor in file.sensors.items()])
-            return Data.independent(tuple(file.sensors), values, noise), prior
-        count = len(values)
-        if [len(row) for row in file.covariance] != [count] * count:
-            raise RequestError(f"covariance has not the shape ({count}, {count}) of {count} sensors")
+            return Data.independent(tuple(file.sensors), np.array(values), noise), prior
+        if [len(row) for row in file.covariance] != [len(values)] * len(values):
+            raise RequestError(f"covariance has not the shape ({len(values)}, {len(values)}) of the sensors")
         if twice := [name for name, sensor in file.sensors.items() if sensor.noise is not None]:
             raise RequestError(f"sensors.{twice[0]}.noise: with a covariance the sensors have no noise of their own")
-        return Data(tuple(file.sensors), values, np.array(file.covariance, float)), prior
+        return Data(tuple(file.sensors), np.array(values), np.array(file.covariance, float)), prior
 
 
 def _deviation(name: str, sensor: _Sensor) -> float:
-    if not isinstance(sensor.noise, str):
-        if sensor.noise is None:
-            raise RequestError(f"sensors.{name}.noise: required, but not given")
-        return sensor.noise
-    with placed(f"sensors.{name}.noise"):
-        found = share(sensor.noise) * abs(sensor.value)
-    if not found > 0.0:
-        raise RequestError(f"sensors.{name}.noise is a share of the value 0, expected a standard deviation")
+    found = sensor.noise
+    if isinstance(found, str):
+        with placed(f"sensors.{name}.noise"):
+            found = share(found) * abs(sensor.value)
+    if not found:
+        raise RequestError(f"sensors.{name}.noise: expected a standard deviation, or a share of a value that is not 0")
     return found
 
 
 def share(text: str) -> float:
     """The number of a text such as "1 %"; a `RequestError` if it is no positive percentage."""
-    found = re.fullmatch(r"\s*(\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+)\s*%\s*", text)
-    if found is None or not 0.0 < (number := float(found[1])) < np.inf:
+    found = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*%\s*", text)
+    if found is None or not float(found[1]) > 0.0:
         raise RequestError(f"{text!r} is no positive percentage, such as 1%")
-    return number / 100.0
+    return float(found[1]) / 100.0
 
 
-def synthetic(outputs: Sequence[Output], exact: Array, noise: float, seed: int) -> str:
-    """A TOML file of data: exact values (k,) with random errors, whose deviations are a share of these values."""
+def synthetic(sensors: Sequence[str], exact: Array, noise: float, seed: int) -> Data:
+    """Exact values (k,) with random errors, whose deviations are a share of these values."""
     deviations = noise * np.abs(exact)
     values = exact + deviations * np.random.default_rng(seed).standard_normal(len(exact))
+    return Data.independent(sensors, values, deviations)
+
+
+def as_toml(data: Data, outputs: Sequence[Output]) -> str:
+    """The file of data with independent errors, of these outputs."""
     lines = []
-    for output, value, deviation in zip(outputs, values.tolist(), deviations.tolist(), strict=True):
+    for output, value, square in zip(outputs, data.values.tolist(), np.diag(data.covariance).tolist(), strict=True):
         name, unit = (json.dumps(text, ensure_ascii=False) for text in (output.name, output.unit))
-        lines += [f"[sensors.{name}]", f"value = {value!r}", f"noise = {deviation!r}", f"unit = {unit}", ""]
+        lines += [f"[sensors.{name}]", f"value = {value!r}", f"noise = {square**0.5!r}", f"unit = {unit}", ""]
     return "\n".join(lines)
 
 
-def refuse_unreachable(data: Data, problem: Problem, reached: Mapping[str, Array]) -> None:
-    """Raise a `RequestError` for a value far from all that its sensor has at training parameters, `reached` by name."""
-    units = {output.name: output.unit for output in problem.outputs}
-    for name, value, noise in zip(data.sensors, data.values, data.noise, strict=True):
-        low, high = float(reached[name].min()), float(reached[name].max())
+def refuse_unreachable(data: Data, reached: Sequence[Array]) -> None:
+    """Raise a `RequestError` for a value far from all that its sensor has at training parameters, `reached` (k×P)."""
+    deviations = np.sqrt(np.diag(data.covariance))
+    for name, value, noise, values in zip(data.sensors, data.values, deviations, reached, strict=True):
+        low, high = float(values.min()), float(values.max())
         # The box may reach a little farther than the training parameters do.
         slack = 0.1 * (high - low) + 5.0 * noise
         if not low - slack <= value <= high + slack:
-            where = f"'{name}' is {value:.4g} {units[name]}, and the parameter box gives {low:.4g} to {high:.4g}"
-            raise RequestError(f"{where}; is the unit right?")
+            found = f"'{name}' is {value:.4g}, and the parameter box gives {low:.4g} to {high:.4g}"
+            raise RequestError(f"{found}; is the unit right?")

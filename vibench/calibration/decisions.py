@@ -4,23 +4,40 @@ Bounds of outputs give an interval of the misfit. Whether one parameter fits bet
 intervals are apart; otherwise the high-fidelity model is asked. A method that consists of such decisions takes the path
 of the high-fidelity model, step by step.
 
-**The accuracy of the high-fidelity solution.** Its natural residuals are at most ε = `ACCURACY`. With S the energy of
-the solution and F that of its contact force, its errors in the norms of the bounds are at most δ with
+**The accuracy of the high-fidelity solution.** Bounds are distances from the exact solution (u, λ), decisions those of
+the computed one (û, λ̂). Let r = f − Aû − Bᵀλ̂, s = Bû − g, d = û − u, and let U be the unit of its residuals:
 
-    δ² ≤ ε² F² + 2ε F (F + Σ_i λ_i ‖B_i‖) ≤ (3 √ε P)²,    P ≥ S and Σ_i λ_i ‖B_i‖ ≥ F,    ‖B_i‖ in the norm of A⁻¹
+    ‖r‖ ≤ εU,    (s_i)₊ ≤ εU ‖B_i‖,    |λ̂ᵀs| ≤ εU²,    U ≤ max(‖Bᵀλ‖, √(‖û‖² + ‖Bᵀλ̂‖²)),
 
-(docs/mathematics.md, "Error bounds"). P follows from the reduced solution and its bounds: with d_i ≥ ‖B_i‖,
-Σ λ_i d_i ≤ Σ λ_N,i d_i + ‖d‖_{W⁻¹} ‖λ − λ_N‖_W. Intervals are widened by δ.
+with ε = `ACCURACY`, in the norms of A and A⁻¹ (`vibench.qp.verification`). Let d_i ≥ ‖B_i‖, P ≥ ‖u‖ and
+P ≥ Σ λ_i d_i ≥ ‖Bᵀλ‖. The difference solves A d + Bᵀ(λ̂ − λ) = −r; its product with d, λ̂ᵀ(Bu − g) ≤ 0 and
+λᵀ(Bu − g) = 0 give
+
+    ‖d‖² ≤ ‖d‖ ‖r‖ + |λ̂ᵀs| + λᵀ(s)₊ ≤ ε (U ‖d‖ + U² + UP),    ‖Bᵀ(λ̂ − λ)‖ ≤ D := ‖d‖ + εU.
+
+Since U ≤ √2 (P + D), the first line is at most (2 + √2) ε (P + D)². Hence D ≤ 1.85 √ε (P + D), and D ≤ 1.86 √ε P.
+Both errors are thus at most δ = 3 √ε P. What is left of the factor 3 covers round-off:
+- Verification passes a violation below the round-off of its row, which has b entries. It is at most 3 (b + 2) 2⁻⁵² d_i
+  times ‖û‖ if d_i bounds Σ_j |B_ij| ‖e_j‖, as below: less than ε ‖û‖ d_i for b < 10⁵.
+- It may judge λ̂ with A⁻¹(f − Bᵀλ̂) in place of û. These differ by at most 64 · 2⁻⁵² √(|û|ᵀ|A||û|), which is less than
+  √ε ‖û‖ where X ≽ σ diag(X) has a σ that floating-point numbers can prove.
+- Outputs and misfits are sums of at most n products.
+Opposite rows, whose gaps verification leaves out, have β = 0, and no bounds here.
+
+P follows from the reduced solution: ‖u‖ ≤ ‖u_N‖ + Δ_u, and with W ≽ σ diag(W)
+
+    Σ λ_i d_i ≤ Σ λ_N,i d_i + √(Σ d_i²/(σ W_ii)) ‖λ − λ_N‖_W.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import inf, sqrt
 from typing import Annotated, NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 from cachetools import LRUCache
 
 from vibench.arrays import Array, is_sound
@@ -28,18 +45,17 @@ from vibench.calibration.data import Data
 from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.highfidelity.active_set import ACCURACY, HighFidelitySolver
 from vibench.interfaces.formulations import FormulationAnswer
+from vibench.interfaces.parameters import outside
 from vibench.interfaces.problem import Contact, Problem
-from vibench.linalg.inner_product import InnerProduct
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee, output_coefficients, output_weights
 from vibench.model.certificates.bounds import OnlineBound, output_error_bound
 from vibench.model.galerkin import contact_at
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline.models import Model
-from vibench.plugins import registry
-from vibench.qp.solve import solve_qp
 from vibench.qp.verification import QPSolution
 from vibench.signatures import Rule, Seed, constructed
+from vibench.stability.coercivity import share_of_diagonal
 from vibench.timing import timed
 
 
@@ -53,6 +69,11 @@ class Prediction(NamedTuple):
     outputs: Array
     bounds: Array
     guarantee: Guarantee
+
+    @classmethod
+    def without_bounds(cls, outputs: Array) -> Prediction:
+        """Nothing is known, and nothing is claimed: the high-fidelity model is asked."""
+        return cls(outputs, np.full(len(outputs), inf), Guarantee.CERTIFIED)
 
 
 Predict = Callable[[Array], Prediction]
@@ -68,17 +89,13 @@ class Sensors:
                 raise unknown_name("output of the problem", name, known)
         self.problem, self.outputs = problem, tuple(known[name] for name in names)
 
-    def of(self, mu: Array, u: Array, lam: Array) -> Array:
-        """The outputs (k,) of a solution u (n,), λ (m,) at mu (d,)."""
-        return np.array([one.values(mu[None], u[:, None], lam[:, None])[0] for one in self.outputs])
-
     def high_fidelity(self) -> Callable[[Array], Array]:
         """From mu (d,) to the outputs (k,) of the high-fidelity solution."""
         solver = HighFidelitySolver(self.problem)
 
         def ask(mu: Array) -> Array:
-            solution = solver.solve(mu)
-            return self.of(mu, solution.u, solution.lam)
+            found = solver.solve(mu)
+            return np.array([one.values(mu[None], found.u[:, None], found.lam[:, None])[0] for one in self.outputs])
 
         return ask
 
@@ -90,74 +107,65 @@ class BoundedSensors:
     """
 
     def __init__(self, model: Model, names: tuple[str, ...]) -> None:
-        self.model, outputs = model, Sensors(model.problem, names).outputs
+        problem, outputs = model.problem, Sensors(model.problem, names).outputs
         if model.certificate is None:
             raise RequestError("the model has no error bounds: a calibration needs one with bounds = true")
-        self.certificate, self.base = model.certificate, model.certificate.base
+        self.model, self.certificate, self.base = model, model.certificate, model.certificate.base
         for output in outputs:
             if not output.linear:
-                linear = ", ".join(one.name for one in model.problem.outputs if one.linear)
+                linear = ", ".join(one.name for one in problem.outputs if one.linear)
                 raise RequestError(f"'{output.name}' is no linear output, and has no bound; linear: {linear or 'none'}")
-        if not self.base.inf_sup.value > 0.0:
+        share = share_of_diagonal(problem.W)
+        if not (self.base.inf_sup.value > 0.0 and share.proved and share.value > 0.0):
             raise RequestError(f"λ has no bound, which the accuracy of solutions needs: {self.base.inf_sup.note}")
-        self.weights = [output_weights(model.problem, self.base, output) for output in outputs]
-        pairs = [output_coefficients(model.problem, output) for output in outputs]
-        self._of_u, of_lam = (np.array(rows) for rows in zip(*pairs, strict=True))
-        reduced = model.reduced
+        self._mass = share.value * problem.W.matrix.diagonal()
+        self._root = np.sqrt((1.0 + self.base.compliance_error) * np.diag(self.base.compliance))
+        self._weights = [output_weights(problem, self.base, output) for output in outputs]
+        of_u, of_lam = map(np.array, zip(*(output_coefficients(problem, output) for output in outputs), strict=True))
+        reduced, self._of_u, self._of_alpha = model.reduced, of_u, of_lam @ model.reduced.generators
         # Where the basis depends on the parameter there is no one map from x to the outputs.
         self._of_x: Array | None = None
         if isinstance(reduced, HyperReducedModel) and reduced.space is None:
-            self._of_x = self._of_u @ reduced.basis
-        self._of_alpha = of_lam @ reduced.generators
+            self._of_x = of_u @ reduced.basis
 
     def __call__(self, mu: Array) -> Prediction:
         """The outputs at mu (d,), with bounds that allow for the accuracy of the high-fidelity solution."""
         model, problem = self.model, self.model.problem
-        assembled = model.online.program(mu)
+        assembled, (settings, solver) = model.online.program(mu), model.settings()
+        answer: FormulationAnswer | QPSolution
         if model.solver is None:
-            answer: FormulationAnswer | QPSolution = model.online.solve(mu, model.settings()[0])
+            answer = model.online.solve(mu, settings)
         else:
-            extra = registry.qp_solver(model.solver)
-            answer = solve_qp(assembled.program, model.solver, model.accuracy, extra, assembled.factor)
+            answer = solver(assembled.program, factor=assembled.factor)
         # Bounds hold for any pair: how well it solves the program shows in their size alone.
         if answer.x is None or answer.alpha is None or not (is_sound(answer.x) and is_sound(answer.alpha)):
-            return self._nothing
+            return Prediction.without_bounds(np.zeros(len(self._weights)))
         x, alpha = answer.x, np.maximum(answer.alpha, 0.0)
+        of_u = self._of_u @ assembled.reconstruct(x[:, None])[:, 0] if self._of_x is None else self._of_x @ x
+        outputs = of_u + self._of_alpha @ alpha
         # Evaluated once for the bounds and the accuracy.
         contact = assembled.evaluated.contact or contact_at(problem, mu)
         assembled = replace(assembled, evaluated=replace(assembled.evaluated, contact=contact))
         bound, _ = self.certificate.certify(problem, mu, assembled, x, alpha, CorrectionMode.NONE)
-        if bound.guarantee is Guarantee.NONE:
-            return self._nothing
-        of_u = self._of_u @ assembled.reconstruct(x[:, None])[:, 0] if self._of_x is None else self._of_x @ x
-        lam = model.reduced.generators @ alpha
-        delta = distance_of_computed(problem.W, self.base.compliance, contact, lam, bound)
+        delta = self._distance_of_computed(contact, model.reduced.generators @ alpha, bound)
         if not delta < inf:
-            return self._nothing
+            return Prediction.without_bounds(outputs)
         widened = replace(bound, u_energy=bound.u_energy + delta, lam=bound.lam + delta / bound.inf_sup)
-        bounds = [output_error_bound(weight, self.base, widened) for weight in self.weights]
-        return Prediction(of_u + self._of_alpha @ alpha, np.array(bounds), bound.guarantee)
+        bounds = [output_error_bound(weights, self.base, widened) for weights in self._weights]
+        return Prediction(outputs, np.array(bounds), bound.guarantee)
 
-    @property
-    def _nothing(self) -> Prediction:
-        # Nothing is known here, and nothing is claimed: the high-fidelity model is asked.
-        count = len(self.weights)
-        return Prediction(np.zeros(count), np.full(count, inf), Guarantee.CERTIFIED)
-
-
-def distance_of_computed(W: InnerProduct, compliance: Array, contact: Contact, lam: Array, bound: OnlineBound) -> float:
-    """The largest distance δ of the computed high-fidelity solution from the exact one.
-
-    `bound` has the bounds of a reduced solution with the multiplier λ_N = `lam` (m,).
-    """
-    # ‖B_i‖ is at most the sum of |B_ij| times the norms of the unit loads.
-    reach = abs(contact.B) @ np.sqrt(np.diag(compliance) / bound.coercivity)
-    if not (bound.lam < inf and bound.relative < inf):
-        return inf
-    force = float(reach @ lam) + float(np.linalg.norm(W.whiten_functional(reach))) * bound.lam
-    # ‖u_N‖ from the relative bound, u_energy over a lower bound of ‖u‖, with a tenth for its round-off.
-    size = 1.1 * (bound.u_energy / bound.relative + 2.0 * bound.u_energy) if bound.relative > 0.0 else 0.0
-    return 3.0 * sqrt(ACCURACY) * max(force, size)
+    def _distance_of_computed(self, contact: Contact, lam: Array, bound: OnlineBound) -> float:
+        """The δ of a reduced solution with the multiplier λ_N = `lam` (m,) and these bounds."""
+        # The relative bound is Δ_u over a lower bound of ‖u‖; there is none of a solution without energy.
+        if not (bound.lam < inf and 0.0 < bound.relative < inf):
+            return inf
+        B = sp.csr_array(contact.B)
+        sizes = np.abs(B.data) * self._root.take(B.indices) / sqrt(bound.coercivity)
+        d = np.bincount(np.repeat(np.arange(len(lam)), np.diff(B.indptr)), sizes, len(lam))
+        force = float(d @ lam) + sqrt(float(d @ (d / self._mass))) * bound.lam
+        # A tenth more for the round-off in ‖u_N‖.
+        size = 1.1 * (bound.u_energy / bound.relative + 2.0 * bound.u_energy)
+        return 3.0 * sqrt(ACCURACY) * max(force, size)
 
 
 @dataclass(eq=False)
@@ -178,18 +186,14 @@ class Interval:
 
 @dataclass
 class Counts:
-    """Decisions, those that asked, questions to the high-fidelity model, audits, and CPU seconds of both models.
-
-    `wrong` are the decisions that the reduced model takes differently without bounds.
-    """
+    """Decisions, those that bounds left open, audits, decisions that the reduced model takes wrongly without bounds."""
 
     decisions: int = 0
     undecided: int = 0
-    questions: int = 0
     audits: int = 0
     wrong: int = 0
+    # CPU seconds of the reduced model.
     model_seconds: float = 0.0
-    question_seconds: list[float] = field(default_factory=list)
 
 
 @constructed
@@ -201,7 +205,7 @@ class Decisions:
     problem, data
         The problem, and the data that its outputs are compared with.
     predict
-        Outputs with bounds: a `BoundedSensors`, or a `CertifiedProgram`; `None` asks the high-fidelity model always.
+        Outputs with bounds, as of `BoundedSensors`; `None` asks the high-fidelity model always.
     audit
         Share of the decided decisions, drawn at random, for which the high-fidelity model is asked all the same.
     seed
@@ -213,10 +217,16 @@ class Decisions:
         audit: Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)] = 0.01, seed: Seed = 0,
     ) -> None:  # fmt: skip
         self.data, self.counts, self.guarantee = data, Counts(), Guarantee.CERTIFIED
-        self._predict, self._ask = predict, Sensors(problem, data.sensors).high_fidelity()
-        self._audit, self.random = audit, np.random.default_rng(seed)
-        # Answers of the high-fidelity model, by the bytes of the parameter.
-        self.answers: dict[bytes, float] = {}
+        self._box, self._predict, self._ask = (
+            problem.parameters,
+            predict,
+            Sensors(problem, data.sensors).high_fidelity(),
+        )
+        self._audit, self._random = audit, np.random.default_rng(seed)
+        # Misfit and CPU seconds of the high-fidelity model by the bytes of the parameter: all that were asked, and
+        # those that an interrupted run has asked before.
+        self.answers: dict[bytes, tuple[float, float]] = {}
+        self.earlier: dict[bytes, tuple[float, float]] = {}
         # Methods compare with what they saw last.
         self._recent: LRUCache[bytes, Interval] = LRUCache(1000)
 
@@ -226,11 +236,12 @@ class Decisions:
         if (known := self._recent.get(key)) is None:
             known = self._recent[key] = self._estimated(mu)
             if key in self.answers:
-                known.lower = known.upper = self.answers[key]
+                known.lower = known.upper = self.answers[key][0]
         return known
 
     def _estimated(self, mu: Array) -> Interval:
-        if (predict := self._predict) is None:
+        # Bounds are claimed in the box alone.
+        if (predict := self._predict) is None or outside(self._box, mu).any():
             return Interval(0.0, inf, 0.0)
         (outputs, bounds, guarantee), seconds = timed(lambda: predict(mu))
         self.counts.model_seconds += seconds.cpu
@@ -242,16 +253,17 @@ class Decisions:
         """The misfit of the high-fidelity model at mu (d,), which is kept; a `RefutedError` if bounds exclude it."""
         key, known = mu.tobytes(), self.interval(mu)
         if key not in self.answers:
-            outputs, seconds = timed(lambda: self._ask(mu))
-            self.counts.questions += 1
-            self.counts.question_seconds.append(seconds.cpu)
-            misfit = self.data.misfit(outputs)
+            misfit, seconds = self.earlier[key] if key in self.earlier else self._solved(mu)
             if not known.lower <= misfit <= known.upper:
                 found = f"the high-fidelity misfit {misfit:.6g} is not between {known.lower:.6g} and {known.upper:.6g}"
                 raise RefutedError(f"the bounds are refuted at mu = {mu.tolist()}: {found}")
-            self.answers[key] = misfit
-        known.lower = known.upper = self.answers[key]
-        return self.answers[key]
+            self.answers[key] = misfit, seconds
+        known.lower = known.upper = self.answers[key][0]
+        return known.lower
+
+    def _solved(self, mu: Array) -> tuple[float, float]:
+        outputs, seconds = timed(lambda: self._ask(mu))
+        return self.data.misfit(outputs), seconds.cpu
 
     def less(self, a: Array, b: Array, shift: float = 0.0) -> bool:
         """Whether the high-fidelity misfit at a (d,) is less than that at b (d,) plus a shift.
@@ -268,7 +280,7 @@ class Decisions:
                 self.ask(mu)
                 if (verdict := one.below(other, shift)) is not None:
                     break
-        elif self._predict is not None and self.random.random() < self._audit:
+        elif self._predict is not None and self._random.random() < self._audit:
             self.counts.audits += 1
             self.ask(a)
             self.ask(b)
@@ -276,11 +288,12 @@ class Decisions:
         return bool(verdict)
 
     @property
-    def is_exact(self) -> bool:
-        """Whether all bounds so far are certified."""
-        return self.guarantee is Guarantee.CERTIFIED
+    def seconds(self) -> float:
+        """CPU seconds of all queries and questions."""
+        return self.counts.model_seconds + sum(seconds for _, seconds in self.answers.values())
 
     @property
     def claim(self) -> str:
         """What holds of the decisions so far."""
-        return "exact" if self.is_exact else f"no contradiction in {self.counts.audits} audits"
+        is_exact = self.guarantee is Guarantee.CERTIFIED
+        return "exact" if is_exact else f"no contradiction in {self.counts.audits} audits"

@@ -106,7 +106,9 @@ class CompiledProgram:
     """A program of `unknowns` and `constraints`, compiled and loaded; an `UnsupportedError` if the compiler fails."""
 
     def __init__(self, source: str, unknowns: int, constraints: int) -> None:
-        self._solve = loaded(source).model_solve_counting
+        # A library that is loaded needs its file no longer.
+        with foreign("the C compiler, or what it makes,"), scratch() as folder:
+            self._solve = ctypes.CDLL(str(_compiled(source, folder))).model_solve_counting
         self._sizes = unknowns, constraints
         self._solve.argtypes, self._solve.restype = [ctypes.c_void_p] * 5, ctypes.c_int
 
@@ -123,13 +125,6 @@ class CompiledProgram:
         if outcome > 1:
             return QPSolution(None, None, text)
         return QPSolution(x, alpha, f"{text} by the dual method" if steps.value < 0 else text, max(steps.value, 0))
-
-
-def loaded(source: str) -> ctypes.CDLL:
-    """The library of a C source, compiled and loaded; an `UnsupportedError` if the compiler fails."""
-    # A library that is loaded needs its file no longer.
-    with foreign("the C compiler, or what it makes,"), scratch() as folder:
-        return ctypes.CDLL(str(_compiled(source, folder)))
 
 
 def compiler() -> list[str]:
