@@ -76,9 +76,7 @@ def cell_model(cell: Cell) -> Model:
     store, queries = usable_store(), cell_queries(cell, query_seconds=1e6)
     certificate, built = queries.certificate, queries.built
     _provide((*built.model_inputs, *(() if certificate is None else (certificate.base, certificate))), store)
-    certified = None if certificate is None else certificate.certificate(store)
-    model = built.model(store, queries.solver, queries.accuracy)
-    return replace(model, certificate=certified, correction=queries.correction)
+    return queries.bounded_model(store)
 
 
 def _provide(stages: Iterable[Stage], store: Store) -> None:

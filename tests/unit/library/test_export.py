@@ -493,3 +493,11 @@ def test_the_code_of_the_page_runs(run: vibench.Run, tmp_path: Path, monkeypatch
         exec(code, found)
     assert found["solution"].status == "ok"
     monkeypatch.delitem(sys.modules, "reduced_model")
+
+
+def test_a_model_of_no_run_is_exported_with_the_name_of_its_problem_alone(run: vibench.Run, tmp_path: Path) -> None:
+    export_model(replace(model_of(run, "radial-obstacle"), row={}), tmp_path / "model.npz", c=True)
+    about = Exported(tmp_path / "model.npz").about
+    assert about["cell"] == {"problem": "Radial"}
+    assert about["source"] == {"distribution": "", "licence": "unknown"}
+    assert ": Radial.\n * Licence of the problem: unknown.\n" in (tmp_path / "model.h").read_text()
