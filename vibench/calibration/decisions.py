@@ -5,22 +5,22 @@ intervals are apart; otherwise the high-fidelity model is asked. A method that c
 of the high-fidelity model, step by step.
 
 **The accuracy of the high-fidelity solution.** Bounds are distances from the exact solution (u, λ), decisions those of
-the computed one (û, λ̂). Let r = f − Aû − Bᵀλ̂, s = Bû − g, d = û − u, and let U be the unit of its residuals:
+the computed one (û, λ̂). Let r = f − Aû − Bᵀλ̂, s = Bû − g, d = û − u, and let U be the unit of its natural residuals,
+which are at most ε (`Sensors.accuracy`). In the norms of A and A⁻¹ (`vibench.qp.verification`)
 
-    ‖r‖ ≤ εU,    (s_i)₊ ≤ εU ‖B_i‖,    |λ̂ᵀs| ≤ εU²,    U ≤ max(‖Bᵀλ‖, √(‖û‖² + ‖Bᵀλ̂‖²)),
+    ‖r‖ ≤ εU,    (s_i)₊ ≤ εU ‖B_i‖,    |λ̂ᵀs| ≤ εU²,    U ≤ max(‖Bᵀλ‖, √(‖û‖² + ‖Bᵀλ̂‖²)).
 
-with ε = `ACCURACY`, in the norms of A and A⁻¹ (`vibench.qp.verification`). Let d_i ≥ ‖B_i‖, P ≥ ‖u‖ and
-P ≥ Σ λ_i d_i ≥ ‖Bᵀλ‖. The difference solves A d + Bᵀ(λ̂ − λ) = −r; its product with d, λ̂ᵀ(Bu − g) ≤ 0 and
-λᵀ(Bu − g) = 0 give
+Let d_i ≥ ‖B_i‖, P ≥ ‖u‖ and P ≥ Σ λ_i d_i ≥ ‖Bᵀλ‖. The difference solves A d + Bᵀ(λ̂ − λ) = −r; its product with d,
+λ̂ᵀ(Bu − g) ≤ 0 and λᵀ(Bu − g) = 0 give
 
     ‖d‖² ≤ ‖d‖ ‖r‖ + |λ̂ᵀs| + λᵀ(s)₊ ≤ ε (U ‖d‖ + U² + UP),    ‖Bᵀ(λ̂ − λ)‖ ≤ D := ‖d‖ + εU.
 
 Since U ≤ √2 (P + D), the first line is at most (2 + √2) ε (P + D)². Hence D ≤ 1.85 √ε (P + D), and D ≤ 1.86 √ε P.
-Both errors are thus at most δ = 3 √ε P. What is left of the factor 3 covers round-off:
+Both errors are thus at most δ = 2 √ε P, and round-off is small beside the rest of the factor 2:
 - Verification passes a violation below the round-off of its row, which has b entries. It is at most 3 (b + 2) 2⁻⁵² d_i
-  times ‖û‖ if d_i bounds Σ_j |B_ij| ‖e_j‖, as below: less than ε ‖û‖ d_i for b < 10⁵.
-- It may judge λ̂ with A⁻¹(f − Bᵀλ̂) in place of û. These differ by at most 64 · 2⁻⁵² √(|û|ᵀ|A||û|), which is less than
-  √ε ‖û‖ where X ≽ σ diag(X) has a σ that floating-point numbers can prove.
+  times ‖û‖ where d_i bounds Σ_j |B_ij| ‖e_j‖, as below: ε is at least 3 (b + 2) 2⁻⁵² here.
+- It may judge λ̂ with A⁻¹(f − Bᵀλ̂) in place of û. These differ by at most 64 · 2⁻⁵² √(|û|ᵀ|A||û|), or 1e-14 √(k/σ) ‖û‖
+  for k entries in a row of X ≽ σ diag(X) at γ = α: less than √ε/10 ‖û‖ down to σ = 1e-12.
 - Outputs and misfits are sums of at most n products.
 Opposite rows, whose gaps verification leaves out, have β = 0, and no bounds here.
 
@@ -43,10 +43,11 @@ from cachetools import LRUCache
 from vibench.arrays import Array, is_sound
 from vibench.calibration.data import Data
 from vibench.errors import NumericalError, RequestError, unknown_name
-from vibench.highfidelity.active_set import ACCURACY, HighFidelitySolver
+from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.formulations import FormulationAnswer
 from vibench.interfaces.parameters import outside
 from vibench.interfaces.problem import Contact, Problem
+from vibench.linalg import EPS
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee, output_coefficients, output_weights
 from vibench.model.certificates.bounds import OnlineBound, output_error_bound
@@ -80,7 +81,13 @@ Predict = Callable[[Array], Prediction]
 
 
 class Sensors:
-    """Outputs of a problem by their names; a `RequestError` if there is no such output."""
+    """Outputs of a problem by their names; a `RequestError` if there is no such output.
+
+    High-fidelity solutions are as accurate as bounds allow for: their natural residuals are at most `accuracy`.
+    """
+
+    # A hundredth of what is verified elsewhere, and a hundred times what is usual: bounds grow by twice its root.
+    accuracy = 1e-12
 
     def __init__(self, problem: Problem, names: tuple[str, ...]) -> None:
         known = {output.name: output for output in problem.outputs}
@@ -90,11 +97,14 @@ class Sensors:
         self.problem, self.outputs = problem, tuple(known[name] for name in names)
 
     def high_fidelity(self) -> Callable[[Array], Array]:
-        """From mu (d,) to the outputs (k,) of the high-fidelity solution."""
+        """From mu (d,) to the outputs (k,) of the high-fidelity solution; a `NumericalError` if it is less accurate."""
         solver = HighFidelitySolver(self.problem)
 
         def ask(mu: Array) -> Array:
             found = solver.solve(mu)
+            if not found.residuals.worst <= self.accuracy:
+                left = f"{found.residuals.worst:.1e} at mu = {mu.tolist()}, above {self.accuracy:.0e}"
+                raise NumericalError(f"the high-fidelity solution has the natural residual {left}")
             return np.array([one.values(mu[None], found.u[:, None], found.lam[:, None])[0] for one in self.outputs])
 
         return ask
@@ -122,11 +132,9 @@ class BoundedSensors:
         self._root = np.sqrt((1.0 + self.base.compliance_error) * np.diag(self.base.compliance))
         self._weights = [output_weights(problem, self.base, output) for output in outputs]
         of_u, of_lam = map(np.array, zip(*(output_coefficients(problem, output) for output in outputs), strict=True))
-        reduced, self._of_u, self._of_alpha = model.reduced, of_u, of_lam @ model.reduced.generators
-        # Where the basis depends on the parameter there is no one map from x to the outputs.
-        self._of_x: Array | None = None
-        if isinstance(reduced, HyperReducedModel) and reduced.space is None:
-            self._of_x = of_u @ reduced.basis
+        reduced, self._of_alpha = model.reduced, of_lam @ model.reduced.generators
+        assert isinstance(reduced, HyperReducedModel)  # as certificates need it
+        self._of_y = of_u @ reduced.basis
 
     def __call__(self, mu: Array) -> Prediction:
         """The outputs at mu (d,), with bounds that allow for the accuracy of the high-fidelity solution."""
@@ -141,8 +149,7 @@ class BoundedSensors:
         if answer.x is None or answer.alpha is None or not (is_sound(answer.x) and is_sound(answer.alpha)):
             return Prediction.without_bounds(np.zeros(len(self._weights)))
         x, alpha = answer.x, np.maximum(answer.alpha, 0.0)
-        of_u = self._of_u @ assembled.reconstruct(x[:, None])[:, 0] if self._of_x is None else self._of_x @ x
-        outputs = of_u + self._of_alpha @ alpha
+        outputs = self._of_y @ assembled.evaluated.in_space(x) + self._of_alpha @ alpha
         # Evaluated once for the bounds and the accuracy.
         contact = assembled.evaluated.contact or contact_at(problem, mu)
         assembled = replace(assembled, evaluated=replace(assembled.evaluated, contact=contact))
@@ -161,11 +168,12 @@ class BoundedSensors:
             return inf
         B = sp.csr_array(contact.B)
         sizes = np.abs(B.data) * self._root.take(B.indices) / sqrt(bound.coercivity)
-        d = np.bincount(np.repeat(np.arange(len(lam)), np.diff(B.indptr)), sizes, len(lam))
+        entries = np.diff(B.indptr)
+        d = np.bincount(np.repeat(np.arange(len(lam)), entries), sizes, len(lam))
         force = float(d @ lam) + sqrt(float(d @ (d / self._mass))) * bound.lam
         # A tenth more for the round-off in ‖u_N‖.
         size = 1.1 * (bound.u_energy / bound.relative + 2.0 * bound.u_energy)
-        return 3.0 * sqrt(ACCURACY) * max(force, size)
+        return 2.0 * sqrt(max(Sensors.accuracy, 3.0 * EPS * (float(entries.max()) + 2.0))) * max(force, size)
 
 
 @dataclass(eq=False)
