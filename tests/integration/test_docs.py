@@ -226,7 +226,7 @@ def test_the_example_of_the_reference_is_a_study_and_its_rules_are_rules(tmp_pat
     [
         ("library.md", 13, {"runs", "tables", "decision.html", "answer.svg"}),
         ("tolerances.md", 2, {"runs"}),
-        ("calibration.md", 2, set()),
+        ("calibration.md", 3, set()),
         ("methods.md", 35, {"runs", "points.npy"}),
     ],
 )
