@@ -94,7 +94,8 @@ def compare(folder: Path) -> None:
                 "high-fidelity chain [s]": seconds, "solutions": solutions, "share": share, "training [s]": training,
                 "a tenth from [steps]": tenth,
             }  # fmt: skip
-            table = pd.concat([*[pd.read_csv(folder / TABLE)] * (folder / TABLE).exists(), pd.DataFrame([row])])
+            earlier = [pd.read_csv(folder / TABLE)] if (folder / TABLE).exists() else []
+            table = pd.concat([*earlier, pd.DataFrame([row])])
             table.to_csv(folder / TABLE, index=False)
             write_page(folder, table)
 
