@@ -196,12 +196,12 @@ class Interval:
 class Counts:
     """Decisions, those that bounds left open, audits, decisions that the reduced model takes wrongly without bounds."""
 
-    decisions: int = 0
-    undecided: int = 0
-    audits: int = 0
-    wrong: int = 0
+    decisions: int
+    undecided: int
+    audits: int
+    wrong: int
     # CPU seconds of the reduced model.
-    model_seconds: float = 0.0
+    model_seconds: float
 
 
 @constructed
@@ -224,7 +224,7 @@ class Decisions:
         self, problem: Problem, data: Data, predict: Predict | None,
         audit: Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)] = 0.01, seed: Seed = 0,
     ) -> None:  # fmt: skip
-        self.data, self.counts, self.guarantee = data, Counts(), Guarantee.CERTIFIED
+        self.data, self.counts, self.guarantee = data, Counts(0, 0, 0, 0, 0.0), Guarantee.CERTIFIED
         self._box, self._predict, self._ask = (
             problem.parameters,
             predict,

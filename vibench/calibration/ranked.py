@@ -15,7 +15,7 @@ from vibench.signatures import Positive, Seed, bordered
 
 @bordered
 def minimise(
-    decisions: Decisions, box: ParameterBox, seed: Seed = 0, iterations: int = 200, tolx: Positive = 1e-4
+    decisions: Decisions, box: ParameterBox, *, seed: Seed, iterations: int, tolx: Positive
 ) -> tuple[Array, Array]:
     """Minimise the misfit over a parameter box by CMA-ES (Hansen 2016), from its centre.
 
@@ -28,11 +28,9 @@ def minimise(
     with foreign("the package cma, of the extra 'calibration',"):
         import cma  # noqa: PLC0415  an extra
     # Criteria that look at values are switched off: ranks are no values. A seed of 0 means the clock.
-    settings = {
-        "seed": seed + 1, "bounds": [0.0, 1.0], "tolx": tolx, "maxiter": iterations, "verbose": -9, "tolfun": 0.0,
-        "tolfunhist": 0.0, "tolflatfitness": np.inf, "tolstagnation": np.inf,
-    }  # fmt: skip
-    strategy = cma.CMAEvolutionStrategy(np.full(box.dim, 0.5), 0.2, settings)
+    ignored = dict.fromkeys(("tolfun", "tolfunhist"), 0.0) | dict.fromkeys(("tolflatfitness", "tolstagnation"), np.inf)
+    limits = {"seed": seed + 1, "bounds": [0.0, 1.0], "tolx": tolx, "maxiter": iterations, "verbose": -9}
+    strategy = cma.CMAEvolutionStrategy(np.full(box.dim, 0.5), 0.2, limits | ignored)
 
     def compare(one: tuple[int, Array], other: tuple[int, Array]) -> int:
         return -1 if decisions.less(one[1], other[1]) else 1
@@ -40,11 +38,11 @@ def minimise(
     best, path = 0.5 * (box.lower + box.upper), []
     while not strategy.stop():
         unit = strategy.ask()
-        candidates = [box.lower + np.asarray(one) * (box.upper - box.lower) for one in unit]
+        candidates = [box.lower + np.asarray(one) * box.widths for one in unit]
         order = sorted(enumerate(candidates), key=cmp_to_key(compare))
         ranks = np.empty(len(unit))
         ranks[[number for number, _ in order]] = np.arange(len(unit))
         strategy.tell(unit, ranks.tolist())
         best = order[0][1] if decisions.less(order[0][1], best) else best
-        path.append(box.lower + np.asarray(strategy.mean) * (box.upper - box.lower))
+        path.append(box.lower + np.asarray(strategy.mean) * box.widths)
     return best, np.array(path)

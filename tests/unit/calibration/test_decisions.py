@@ -173,12 +173,12 @@ def test_cma_on_ranks_takes_the_path_of_the_high_fidelity_model() -> None:
     pytest.importorskip("cma")
     box, measured = radial().parameters, data(0.003)
     found, exact = (
-        minimise(Decisions(radial().problem, measured, predict), box, seed=4, iterations=8)
+        minimise(Decisions(radial().problem, measured, predict), box, seed=4, iterations=8, tolx=1e-4)
         for predict in (bounded(), None)
     )
     assert np.array_equal(found[0], exact[0])
     assert np.array_equal(found[1], exact[1])
-    longer = minimise(Decisions(radial().problem, measured, bounded()), box, seed=4, iterations=40)
+    longer = minimise(Decisions(radial().problem, measured, bounded()), box, seed=4, iterations=40, tolx=1e-4)
     outputs = Sensors(radial().problem, NAMES).high_fidelity()(longer[0])
     assert (np.abs(outputs - measured.values) < 2.0 * np.sqrt(np.diag(measured.covariance))).all()
 
