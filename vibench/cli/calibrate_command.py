@@ -68,7 +68,7 @@ def calibrate(
         refuse_unreachable(measured, [one.values(solved.mu, solved.u, solved.lam) for one in sensors])
     decisions = Decisions(target, measured, predict, share(audit), seed)
     chain, folder = Metropolis(decisions, prior, steps // 5, seed), out or Path("calibrations") / data.stem
-    about = {"data": data.read_text(), "cell": chosen.key, "steps": steps, "audit": audit, "seed": seed}
+    about = {"data": data.read_text(encoding="utf-8"), "cell": chosen.key, "steps": steps, "audit": audit, "seed": seed}
     _walk(chain, steps, folder / "chain.npz", json.dumps(about, sort_keys=True), fresh=fresh)
     echo(f"model: {chosen}")
     _conclude(chain, folder, training.cpu)
