@@ -21,8 +21,6 @@ from vibench.interfaces.problem import Problem
 from vibench.signatures import constructed
 from vibench.study.matrix import read_toml
 
-Deviation = Annotated[FiniteFloat, Field(gt=0.0)]
-
 
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -30,13 +28,13 @@ class _Table(BaseModel):
 
 class _Sensor(_Table):
     value: FiniteFloat
-    noise: Deviation | str | None = None
+    noise: FiniteFloat | str | None = None
     unit: str | None = None
 
 
 class _Normal(_Table):
     mean: FiniteFloat
-    sd: Deviation
+    sd: Annotated[FiniteFloat, Field(gt=0.0)]
 
 
 class _File(_Table):
@@ -149,7 +147,7 @@ def _deviation(name: str, sensor: _Sensor) -> float:
     if isinstance(found, str):
         with placed(f"sensors.{name}.noise"):
             found = share(found) * abs(sensor.value)
-    if not found:
+    if found is None or not found > 0.0:
         raise RequestError(f"sensors.{name}.noise: expected a standard deviation, or a share of a value that is not 0")
     return found
 

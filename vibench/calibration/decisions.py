@@ -40,18 +40,18 @@ import numpy as np
 import scipy.sparse as sp
 from cachetools import LRUCache
 
-from vibench.arrays import Array, is_sound
+from vibench.arrays import Array, SparseMatrix, is_sound
 from vibench.calibration.data import Data
 from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.formulations import FormulationAnswer
 from vibench.interfaces.parameters import outside
-from vibench.interfaces.problem import Contact, Problem
+from vibench.interfaces.problem import Problem
 from vibench.linalg import EPS
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee, output_coefficients, output_weights
 from vibench.model.certificates.bounds import OnlineBound, output_error_bound
-from vibench.model.galerkin import contact_at
+from vibench.model.galerkin import Evaluated, contact_at
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline.models import Model
 from vibench.qp.verification import QPSolution
@@ -130,6 +130,8 @@ class BoundedSensors:
             raise RequestError(f"λ has no bound, which the accuracy of solutions needs: {self.base.inf_sup.note}")
         self._mass = share.value * problem.W.matrix.diagonal()
         self._root = np.sqrt((1.0 + self.base.compliance_error) * np.diag(self.base.compliance))
+        # Where B(µ) is θ(µ) B₀ it need not be assembled.
+        self._is_scaled, self._reach = self.base.bound_terms is not None, self._lengths(self.base.constraint)
         self._weights = [output_weights(problem, self.base, output) for output in outputs]
         of_u, of_lam = map(np.array, zip(*(output_coefficients(problem, output) for output in outputs), strict=True))
         reduced, self._of_alpha = model.reduced, of_lam @ model.reduced.generators
@@ -150,30 +152,39 @@ class BoundedSensors:
             return Prediction.without_bounds(np.zeros(len(self._weights)))
         x, alpha = answer.x, np.maximum(answer.alpha, 0.0)
         outputs = self._of_y @ assembled.evaluated.in_space(x) + self._of_alpha @ alpha
-        # Evaluated once for the bounds and the accuracy.
-        contact = assembled.evaluated.contact or contact_at(problem, mu)
-        assembled = replace(assembled, evaluated=replace(assembled.evaluated, contact=contact))
+        if not self._is_scaled and assembled.evaluated.contact is None:
+            # Evaluated once for the bounds and the accuracy.
+            assembled = replace(assembled, evaluated=replace(assembled.evaluated, contact=contact_at(problem, mu)))
         bound, _ = self.certificate.certify(problem, mu, assembled, x, alpha, CorrectionMode.NONE)
-        delta = self._distance_of_computed(contact, model.reduced.generators @ alpha, bound)
+        delta = self._distance_of_computed(assembled.evaluated, model.reduced.generators @ alpha, bound)
         if not delta < inf:
             return Prediction.without_bounds(outputs)
         widened = replace(bound, u_energy=bound.u_energy + delta, lam=bound.lam + delta / bound.inf_sup)
         bounds = [output_error_bound(weights, self.base, widened) for weights in self._weights]
         return Prediction(outputs, np.array(bounds), bound.guarantee)
 
-    def _distance_of_computed(self, contact: Contact, lam: Array, bound: OnlineBound) -> float:
+    def _distance_of_computed(self, evaluated: Evaluated, lam: Array, bound: OnlineBound) -> float:
         """The δ of a reduced solution with the multiplier λ_N = `lam` (m,) and these bounds."""
         # The relative bound is Δ_u over a lower bound of ‖u‖; there is none of a solution without energy.
         if not (bound.lam < inf and 0.0 < bound.relative < inf):
             return inf
-        B = sp.csr_array(contact.B)
-        sizes = np.abs(B.data) * self._root.take(B.indices) / sqrt(bound.coercivity)
-        entries = np.diff(B.indptr)
-        d = np.bincount(np.repeat(np.arange(len(lam)), entries), sizes, len(lam))
+        theta, (d, entries) = 1.0, self._reach
+        if self._is_scaled:
+            theta = abs(float(evaluated.samples.get("B", self.base.one)[0]))
+        elif evaluated.contact is not None:
+            d, entries = self._lengths(evaluated.contact.B)
+        d = d * (theta / sqrt(bound.coercivity))
         force = float(d @ lam) + sqrt(float(d @ (d / self._mass))) * bound.lam
         # A tenth more for the round-off in ‖u_N‖.
         size = 1.1 * (bound.u_energy / bound.relative + 2.0 * bound.u_energy)
-        return 2.0 * sqrt(max(Sensors.accuracy, 3.0 * EPS * (float(entries.max()) + 2.0))) * max(force, size)
+        return 2.0 * sqrt(max(Sensors.accuracy, 3.0 * EPS * (entries + 2.0))) * max(force, size)
+
+    def _lengths(self, B: SparseMatrix) -> tuple[Array, int]:
+        """The sums Σ_j |B_ij| ‖e_j‖ (m,) in the norm of X⁻¹, and the largest number of entries of a row."""
+        B = sp.csr_array(B)
+        counts, sizes = np.diff(B.indptr), np.abs(B.data) * self._root.take(B.indices)
+        sums = np.bincount(np.repeat(np.arange(len(counts)), counts), sizes, len(counts))
+        return np.asarray(sums, float), int(counts.max())
 
 
 @dataclass(eq=False)

@@ -98,7 +98,7 @@ RIGHT: dict[str, Any] = {"value": -0.07, "noise": 0.001}
         ({OUTER: {"value": 1.0}}, "", f"sensors.{OUTER}.noise: expected a standard deviation"),
         ({OUTER: {"value": 0.0, "noise": "1%"}}, "", "a share of a value that is not 0"),
         ({OUTER: {"value": 1.0, "noise": "one"}}, "", "'one' is no positive percentage"),
-        ({OUTER: {"value": 1.0, "noise": -0.1}}, "", "greater than 0"),
+        ({OUTER: {"value": 1.0, "noise": -0.1}}, "", f"sensors.{OUTER}.noise: expected a standard deviation"),
         ({OUTER: {"value": "x", "noise": 0.1}}, "", f"sensors.{OUTER}.value: Input should be a valid number"),
         ({OUTER: {**RIGHT, "sd": 1.0}}, "", "no key is called 'sd'"),
         ({}, "", "sensors"),
