@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 
-from vibench.calibration import data as package
 from vibench.calibration.data import Prior, synthetic
 from vibench.calibration.decisions import BoundedSensors, Decisions, Predict, Prediction, Sensors
 from vibench.calibration.metropolis import Metropolis
 from vibench.errors import NumericalError
 from vibench.offline.models import Model
-from vibench.provenance import source_hash
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Result, Row, Stage
 from vibench.stages.cell_queries import CellQueries
@@ -30,11 +26,6 @@ class CalibrationStage(Stage):
     queries: CellQueries
     # Key of the cell.
     cell: str
-
-    @classmethod
-    @cache
-    def code(cls) -> str:
-        return f"{super().code()} {source_hash(Path(package.__file__).parent)}"
 
     @property
     def packages(self) -> frozenset[str]:
