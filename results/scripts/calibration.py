@@ -25,7 +25,7 @@ from vibench.calibration.metropolis import Metropolis
 STEPS, BURN_IN, SEED, NOISES = 5000, 1000, 2022, (0.03, 0.01, 0.003)
 PROBLEMS = {"obstacle": (1.05, 0.01, -0.02), "hertz": (1.03,)}
 TABLE = "chains.csv"
-TOLERANCES = {"obstacle": (1e-4, 1e-3), "hertz": (1e-4, 1e-3)}
+TOLERANCES = {"obstacle": (3e-5, 3e-4), "hertz": (1e-4, 1e-3)}
 
 
 def data_of(problem: vibench.Problem, truth: tuple[float, ...], noise: float) -> Data:
@@ -115,10 +115,13 @@ def write_page(folder: Path, table: pd.DataFrame) -> None:
         "# Calibration: chains compared state by state", "",
         "    python results/scripts/calibration.py results/calibration", "",
         f"Metropolis chains of {STEPS} steps, the first {BURN_IN} of which adapt, on problems at the paper's size.",
-        "The data are synthetic, at (1.05, 0.01, −0.02) of the obstacle and at the radius 1.03 of Hertz.", "",
+        "The data are synthetic, at (1.05, 0.01, −0.02) of the obstacle and at the radius 1.03 of Hertz. Tolerances of",
+        "POD and cone are 3e-5 and 3e-4 for the obstacle, whose bounds interpolation limits, 1e-4 and 1e-3 for Hertz.",
+        "",
         "The states of the chains whose decisions the high-fidelity model takes are in",
         f"{', '.join(f'[{name}]({name})' for name in files)}. [The table](chains.csv) has a column for each row below.",
-        "Seconds are CPU seconds on a machine with other load. Proposals outside the box are no decisions.", "",
+        "Seconds are CPU seconds on a machine with other load, those of the high-fidelity chain at the mean of the",
+        "questions. Proposals outside the box are no decisions.", "",
         shown.iloc[1:].to_markdown(headers=["problem", *shown.iloc[0]]), "",
     ]  # fmt: skip
     (folder / "README.md").write_text("\n".join(lines), encoding="utf-8")
