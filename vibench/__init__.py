@@ -10,7 +10,7 @@ from types import FunctionType
 
 import lazy_loader
 
-GROUPS = ("linalg", "packs", "qp", "reduction", "report", "stability")
+GROUPS = ("calibration", "linalg", "packs", "qp", "reduction", "report", "stability")
 """Submodules with public names of their own."""
 
 _attached, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

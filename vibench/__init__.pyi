@@ -3,6 +3,7 @@
 Tools of algorithms and figures are in the submodules named first, whose `__init__.pyi` lists them.
 """
 
+from . import calibration as calibration
 from . import fem as fem
 from . import linalg as linalg
 from . import packs as packs

@@ -122,7 +122,7 @@ def core_code() -> str:
 
 
 LAYERS = (
-    "stages", "offline", "results.consistency", "results.pictures", "study.parameter_sets", "packs",
+    "stages", "calibration", "offline", "results.consistency", "results.pictures", "study.parameter_sets", "packs",
     "model", "highfidelity", "stability", "reduction", "qp", "fem", "interfaces", "linalg", "timing", "arrays",
 )  # fmt: skip
 """Packages and modules that determine numbers, from top to bottom as in the contracts of import-linter.

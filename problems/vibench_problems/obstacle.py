@@ -228,18 +228,22 @@ class Obstacle(Problem):
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        """Force and area of the contact at mu, and the deflection of a point outside the disc, which moves with h(mu).
+        """Force and area of the contact at mu, and deflections of three points outside the disc, which move with h(mu).
 
-        The point is the node nearest to (0.35 m, 0) of the reference domain, half-way between the disc and the edge.
+        The points are the nodes nearest to (0.35 m, 0), (−0.35 m, 0) and (0, −0.35 m) of the reference domain, half-way
+        between the disc and the edge.
         """
-        place = np.linalg.norm(self.mesh.p[:, self.free] - np.array([[0.35], [0.0]]), axis=0).argmin()
-        at_point = np.zeros(self.V.dim)
-        at_point[place] = 1.0
+        places = {"deflection": (0.35, 0.0), "left deflection": (-0.35, 0.0), "lower deflection": (0.0, -0.35)}
         return (
             Output("contact force", "m", function=lambda mu, _, lam: float(self._integrals(mu) @ lam)),
             Output("contact area", "m²", function=lambda mu, _, lam: float(self._integrals(mu) @ (lam > 0.0))),
-            Output("deflection", "m", u=at_point),
+            *(Output(name, "m", u=self._at(place)) for name, place in places.items()),
         )
+
+    def _at(self, place: tuple[float, float]) -> Array:
+        found = np.zeros(self.V.dim)
+        found[np.linalg.norm(self.mesh.p[:, self.free] - np.array(place)[:, None], axis=0).argmin()] = 1.0
+        return found
 
     def _integrals(self, mu: Array) -> Array:
         """Integrals (m,) of the multiplier functions over the disc at mu."""

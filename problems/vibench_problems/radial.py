@@ -13,7 +13,7 @@ from scipy.special import lambertw
 from skfem import Basis, ElementTriP1, MeshTri
 from skfem.models.poisson import laplace
 
-from vibench import AffineProblem, Array, InnerProduct, ParameterBox, Picture, fem
+from vibench import AffineProblem, Array, InnerProduct, Output, ParameterBox, Picture, fem
 from vibench_problems.disc_mesh import rings_in_disc
 
 RINGS = {"coarse": 11, "medium": 20, "paper": 34, "fine": 68}
@@ -150,6 +150,17 @@ class Radial(AffineProblem):
             return 0.0
         plateau = float(np.median(lam[active]))
         return float(np.sqrt(self.W.apply(lam).sum() / (np.pi * plateau)))
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Deflections of the nodes nearest to (¼, 0), which is in contact, (0.55 m, 0) and (0.8 m, 0)."""
+        places = (("inner", 0.25), ("middle", 0.55), ("outer", 0.8))
+        return tuple(Output(f"{name} deflection", "m", u=self._at(x)) for name, x in places)
+
+    def _at(self, x: float) -> Array:
+        found = np.zeros(self.V.dim)
+        found[np.linalg.norm(self.mesh.p[:, self.free] - np.array([[x], [0.0]]), axis=0).argmin()] = 1.0
+        return found
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture:  # noqa: ARG002
         """The membrane's deflection and the multiplier."""

@@ -250,6 +250,7 @@ def test_the_example_of_the_reference_is_a_study_and_its_rules_are_rules(tmp_pat
         ("report.md", 5, {"runs", "tables", "decision.html", "answer.svg"}),
         ("measurement.md", 0, set()),
         ("tolerances.md", 2, {"runs"}),
+        ("calibration.md", 3, set()),
         ("methods.md", 34, {"points.npy"}),
     ],
 )

@@ -24,6 +24,7 @@ from typer import Argument, Option
 
 from vibench.cli import plugin_commands as plugins
 from vibench.cli import result_commands as results
+from vibench.cli.calibrate_command import calibrate
 from vibench.cli.completion import examples, whole_words
 from vibench.cli.console import echo, fitted, warn
 from vibench.cli.pack_commands import pack
@@ -208,8 +209,8 @@ class _Command(typer.core.TyperCommand):
 for _name, _call in dict[str, Callable[..., None]](
     run=run_study_command, list=plugins.list_plugins, show=results.show, report=results.write_report,
     figures=results.draw_figures, compare=results.compare_runs, replay=results.replay_query, export=results.export,
-    serve=results.serve, pack=pack, check=plugins.check_plugin, new=plugins.new_plugin, bench=plugins.bench_plugins,
-    publish=results.publish_runs, clean=clean, doctor=doctor, help=help_on,
+    serve=results.serve, calibrate=calibrate, pack=pack, check=plugins.check_plugin, new=plugins.new_plugin,
+    bench=plugins.bench_plugins, publish=results.publish_runs, clean=clean, doctor=doctor, help=help_on,
 ).items():  # fmt: skip
     # Without an own default map a command would take the default above of an option of the same name for its own.
     app.command(_name, cls=_Command, epilog=examples(_name), context_settings={"default_map": {}})(interruptible(_call))

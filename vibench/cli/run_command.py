@@ -63,7 +63,7 @@ def run_study_command(
         from vibench.study.matrix import expand
 
         overrides = {
-            "problem": [_problem(one) for one in problem or ()], "formulation": formulation, "dual": dual,
+            "problem": [problem_entry(one) for one in problem or ()], "formulation": formulation, "dual": dual,
             "primal": primal, "solvers": solver, "correction": correction, "pod": pod_tol, "dual_tol": dual_tol,
             "primal_tol": primal_tol,
         }  # fmt: skip
@@ -131,7 +131,7 @@ def _conclude(outcome: RunResult, folder: Path, *, draw: bool, fresh: bool, stri
         raise typer.Exit(1)
 
 
-def _problem(text: str) -> Any:
+def problem_entry(text: str) -> Any:
     """A problem of the command line: its name, the class of a Python file, or the entry of a pack's folder."""
     import runpy
 

@@ -56,12 +56,7 @@ class RecordedCell:
         if self.cell.code != self.row["code"]:
             others = "by other code, with another version of its solver, or from files that were changed since"
             raise RequestError(f"cell {self.row['cell']} was computed {others}; run its study again")
-        store, queries = usable_store(), cell_queries(self.cell, query_seconds=1e6)
-        certificate, built = queries.certificate, queries.built
-        _provide((*built.model_inputs, *(() if certificate is None else (certificate.base, certificate))), store)
-        certified = None if certificate is None else certificate.certificate(store)
-        model = built.model(store, queries.solver, queries.accuracy)
-        return replace(model, certificate=certified, row=self.row, correction=queries.correction)
+        return replace(cell_model(self.cell), row=self.row)
 
     @cached_property
     def parameters(self) -> Array:
@@ -74,6 +69,14 @@ class RecordedCell:
     def rows(self, table: str) -> dict[int, dict[str, Any]]:
         names, rows = read_rows(self.path, table, (self.row["cell"],))
         return {int(row["query"]): row for row in (dict(zip(names, row, strict=True)) for row in rows)}
+
+
+def cell_model(cell: Cell) -> Model:
+    """The model of a cell, with its bounds; stages without artefacts are run."""
+    store, queries = usable_store(), cell_queries(cell, query_seconds=1e6)
+    certificate, built = queries.certificate, queries.built
+    _provide((*built.model_inputs, *(() if certificate is None else (certificate.base, certificate))), store)
+    return queries.bounded_model(store)
 
 
 def _provide(stages: Iterable[Stage], store: Store) -> None:

@@ -24,6 +24,7 @@ from vibench.results.show import exported_files
 from vibench.results.sqlite import FILE, DamagedResultsError, damaged, read_meta, set_aside, study_of
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Row, Stage, value_of
+from vibench.stages.calibration import CalibrationStage
 from vibench.stages.cell_queries import CellRows
 from vibench.stages.pictures import PictureStage
 from vibench.stages.timing_rounds import TimedRound, seconds_of_cell, seconds_of_queries
@@ -127,8 +128,24 @@ class ResultWriter:
             rows.append([named | {"step": history.first_step + k, "value": v} for k, v in enumerate(history.values)])
         if rows:
             self.database.write_histories(rows, partial=stage.partial)
+        if isinstance(stage, CalibrationStage):
+            self.calibrations(stage, value_of(store, stage))
         if isinstance(stage, PictureStage):
             self.pictures(stage, picture_rows(value_of(store, stage)))
+
+    def calibrations(self, stage: CalibrationStage, rows: Iterable[Row]) -> None:
+        """Write the chains of a cell that has its row, or the reason why there are none."""
+        row = self.database.cell(stage.cell)
+        assert row is not None  # cells are calibrated only when they have their rows
+        keys = {"cell": stage.cell, **{name: row[name] for name in KEYS}}
+        self.database.replace("calibrations", [keys | one for one in rows], cell=stage.cell)
+
+    def uncalibrated(self) -> set[str]:
+        """Keys of the ok cells without chains, in a study with this task."""
+        if not self.study.task:
+            return set()
+        fine = {key for key, (status, _) in self.database.finished().items() if status == Status.OK}
+        return fine - {row["cell"] for row in self.database.rows("calibrations")}
 
     def pictures(self, stage: PictureStage, rows: Iterable[Row]) -> None:
         """Write the pictures of a problem, or the reason why there are none."""

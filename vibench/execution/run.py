@@ -31,7 +31,8 @@ from vibench.results.consistency import disagreement_rows
 from vibench.results.database import ResultsDatabase
 from vibench.stages.artefacts import Store, usable_store
 from vibench.stages.base import Done, Failed, Stage, Unstored
-from vibench.stages.cell_queries import CellRows, cell_queries
+from vibench.stages.calibration import CalibrationStage
+from vibench.stages.cell_queries import CellQueries, CellRows, cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.stages.timing_rounds import QUERY_SUBSETS, TimingRounds
 from vibench.study.cells import Cell
@@ -192,23 +193,27 @@ class _Run:
         self.timing = TimingPlan(goals, max(rounds, requested), self.writer, max(fewest, requested))
         self.offline = OfflinePlan(self.store, self.writer, max(self.options.repeats - 1, 0))
         untimed = self.timing.start(runnable)
+        uncalibrated = self.writer.uncalibrated()
+        waiting = [cell for cell in goals if cell.key in uncalibrated and cell not in runnable]
         workers: Executor | None = None
         interrupted = False
         try:
-            if runnable or untimed:
+            if runnable or untimed or waiting:
                 dask, count, log = self.options.executor == "dask", self.options.workers, self.folder / LOG
                 workers = Dask(self.options.scheduler, count, self.store.folder) if dask else Local(count, log)
                 self.machines = workers.machines
             # One training set of a problem is drawn, the first one.
-            pictured: dict[Plugin, Stage] = {}
-            for cell in cells:
-                pictured.setdefault(cell.problem, PictureStage(cell.problem, cell.training))
+            pictured: dict[Plugin, Stage] = {
+                one.problem: PictureStage(one.problem, one.training) for one in cells[::-1]
+            }
             for cell in runnable:
                 self.cells.setdefault(goals[cell].key, []).append(cell)
                 for stage in (goals[cell], pictured[cell.problem]):
                     self.graph.add_goal(stage, self._is_available)
             for group in untimed:
                 self._time(group, plan=False)
+            for cell in waiting:
+                self._calibrate(cell, goals[cell], plan=False)
             slots = workers.slots if workers is not None else 0
             left_out = [cell for cell in todo if cell.key in reasons]
             self.observer.start(Agenda(len(cells), len(todo), len(left_out), [*self.graph.stages.values()], slots))
@@ -268,6 +273,8 @@ class _Run:
         if isinstance(outcome, Failed):
             # The last stage of a cell has no name that a user knows.
             reason = outcome.reason if stage.key in self.cells else f"in {stage.label}: {outcome.reason}"
+            if isinstance(stage, CalibrationStage):
+                self.writer.calibrations(stage, [{"reason": outcome.reason}])
             if isinstance(stage, PictureStage):
                 self.writer.pictures(stage, [{"reason": outcome.reason}])
             self._timed(stage, outcome)
@@ -285,7 +292,17 @@ class _Run:
             self._timed(stage, outcome.value)
         for cell in self.cells.get(stage.key, ()):
             self.observer.cell(cell, self.writer.cell(cell, outcome.value))
+            if self.study.task:
+                self._calibrate(cell, stage)
             self._ended(cell)
+
+    def _calibrate(self, cell: Cell, queries: Stage, *, plan: bool = True) -> None:
+        """Plan the chains of a cell that has its row."""
+        assert isinstance(queries, CellQueries)  # the goal of a cell
+        calibration = CalibrationStage(queries, cell.key)
+        self.graph.add_goal(calibration, self._is_available)
+        if plan and calibration.key in self.graph.waiting:
+            self.observer.plan(calibration)
 
     def _ended(self, cell: Cell) -> None:
         if (group := self.timing.ended(cell)) is not None:

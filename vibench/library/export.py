@@ -194,7 +194,8 @@ def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, A
             "linear": [{"name": output.name, "unit": output.unit} for output in _linear(model.problem)],
             "left_out": [output.name for output in model.problem.outputs if not output.linear],
         },
-        "cell": {name: _plain(row[name]) for name in recorded if name in row},
+        # A model of no run has the name of its problem alone.
+        "cell": {"problem": type(model.problem).__name__} | {n: _plain(row[n]) for n in recorded if n in row},
         "exported_by": f"vibench {distribution_version('vibench')}",
         "source": {"distribution": origin, "licence": model.problem.licence or _licence(origin.partition(" ")[0])},
     }

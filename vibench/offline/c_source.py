@@ -79,8 +79,8 @@ def source(
     parameters, sets, factor = (arrays.get(f"start_{name}", np.zeros(0)) for name in ("parameters", "sets", "factor"))
     values = {
         "name": name, "macro": name.upper(),
-        "origin": _comment(", ".join(str(cell.get(key, "")) for key in ("problem", "dual", "primal", "cell"))),
-        "licence": _comment(f"{about['source']['distribution']}, {about['source']['licence']}"),
+        "origin": _comment(", ".join(str(cell[key]) for key in ("problem", "dual", "primal", "cell") if key in cell)),
+        "licence": _comment(", ".join(filter(None, about["source"].values()))),
         "exporter": _comment(about["exported_by"]),
         "parameters": _comment(", ".join(f"{n} [{u}]" for n, u in zip(box["names"], box["units"], strict=True))),
         "dimension": len(arrays["lower"]), "unknowns": members["f"].terms.shape[1],

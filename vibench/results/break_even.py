@@ -22,9 +22,6 @@ from vibench.timing import Seconds
 # Probability left out on each side of a 95 % interval.
 TAIL = 0.025
 
-# Standard deviation of the logarithm of offline seconds measured once, where a run repeats no stage.
-SCATTER = 0.2
-
 # Value of `primal_a` where a is the high-fidelity model.
 HIGH_FIDELITY = "high-fidelity"
 
@@ -230,7 +227,8 @@ def scatter(runs: Iterable[Sequence[Seconds]]) -> float:
     """Standard deviation of the logarithm of offline seconds, from the runs of stages timed more than once."""
     logarithms = [np.log([one.cpu for one in some]) for some in runs if is_repeated(len(some), some[0].cpu)]
     if not logarithms:
-        return SCATTER
+        # A run that repeats no stage says nothing: this is what others have.
+        return 0.2
     squares = sum(float(np.sum((one - one.mean()) ** 2)) for one in logarithms)
     return float(np.sqrt(squares / sum(len(one) - 1 for one in logarithms)))
 
@@ -249,7 +247,7 @@ def offline_draws(cell: Row, shared: float, rng: np.random.Generator) -> Array:
     """Offline seconds (`DRAWS`,) of a cell that other runs might measure; those that are `shared` do not vary."""
     low, high = cell["offline_low_s"], cell["offline_high_s"]
     # The deviation from its 95 % interval, see `offline_factor`.
-    spread = SCATTER if low is None or math.isnan(low) else math.log(high / low) / (2.0 * 1.96)
+    spread = scatter([]) if low is None or math.isnan(low) else math.log(high / low) / (2.0 * 1.96)
     return np.asarray(shared + (cell["offline_s"] - shared) * np.exp(spread * rng.standard_normal(DRAWS)))
 
 

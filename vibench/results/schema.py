@@ -14,7 +14,7 @@ Row: TypeAlias = Mapping[str, Any]
 """A row of a table: column → value."""
 
 # Increase it with every change of the schema: a results file of another version is refused.
-VERSION = 22
+VERSION = 23
 
 
 class SqlType(StrEnum):
@@ -410,6 +410,21 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "error_zero_max": real("1", "Largest error of these, over the scale."),
         "error_scaled_mean": real("1", "Mean error over the scale, of all ok queries.", "error / scale", 15),
         "error_scaled_max": real("1", "Largest error over the scale, likewise."),
+    },
+    "calibrations": {
+        "cell": _cell()._replace(heading="cell", place=0),
+        **KEYS,
+        "noise": real("1", "Standard deviation of the noise of all sensors, a share of their values.", "noise", 10),
+        "steps": integer("Steps of the chain, a quarter of which is its burn-in.", "steps", 11),
+        "decisions": integer("Its decisions: proposals in the parameter box.", "decisions", 12),
+        "asked": real("1", "Share of the decisions that bounds left open, for the high-fidelity model.", "asked", 13),
+        "questions": integer("High-fidelity solutions, with those for audits.", "questions", 14),
+        "audits": integer("Decisions by bounds that the high-fidelity model was asked all the same."),
+        "wrong": integer("Decisions that the reduced model takes wrongly without bounds.", "wrong", 15),
+        "claim": text("exact, for certified bounds, or no contradiction in so many audits.", "claim", 16),
+        "calibration_s": real("s", "Queries and questions of the chain.", "chain [s]", 17),
+        "hf_chain_s": real("s", "The high-fidelity chain, at the mean of the questions.", "high-fidelity [s]", 18),
+        "reason": text("Why there is no chain."),
     },
     "solutions": {
         "cell": _cell(),

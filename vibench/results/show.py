@@ -58,6 +58,10 @@ def _views() -> dict[str, View]:
         *AXES, "output", "unit", "error_mean", "error_max", "error_scaled_mean", "scale", "queries_ok", "queries_zero",
         "cell",
     )  # fmt: skip
+    of_calibrations = (
+        "problem", "formulation", "noise", "asked", "wrong", "questions", "calibration_s", "hf_chain_s", "claim",
+        "decisions", "pod_tol", "dual_tol", "dual", "primal", "primal_tol", "cell", "steps", "audits", "reason",
+    )  # fmt: skip
     compared = ("difference_max", "flagged", "queries", "allowed_worst", "query_flagged")
     of_timings = (*AXES, "cell", "round", "total_s", "assemble_s", "solve_s", "queries", "slowdown")
     cells, thresholds = STORED["cells"], STORED["thresholds"]
@@ -72,6 +76,7 @@ def _views() -> dict[str, View]:
         "timings": View("timings", of_timings),
         "thresholds": View("thresholds", of_break_even),
         "outputs": View("outputs", of_outputs),
+        "calibrations": View("calibrations", of_calibrations),
         "disagreements": View("disagreements", ("solver_a", "solver_b", *AXES, *compared)),
     }
 

@@ -6,7 +6,7 @@ import json
 import math
 import resource
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -19,6 +19,7 @@ from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee
 from vibench.model.errors import ReferenceSolutions, output_scales, summarise_outputs, zeros
 from vibench.offline.assemblies import assemblies
+from vibench.offline.models import Model
 from vibench.offline.solution import Corrector
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
@@ -162,6 +163,12 @@ class CellQueries(ItemwiseStage):
         offline = (stage for stages in self.offline_stages.values() for stage in stages)
         assessment = (*exact, *offline, *self.constants, *self.reference.stages, *self.validation)
         return tuple(dict.fromkeys((*self.model_inputs, *assessment)))
+
+    def bounded_model(self, store: Store) -> Model:
+        """The model of the cell, with its bounds if it has them."""
+        certified = None if self.certificate is None else self.certificate.certificate(store)
+        model = self.built.model(store, self.solver, self.accuracy)
+        return replace(model, certificate=certified, correction=self.correction)
 
     def queries(self, store: Store) -> Queries:
         """The queries of the model, which cells that differ only in their solver share."""

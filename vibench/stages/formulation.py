@@ -42,8 +42,8 @@ storable(
     SpannedCoordinates, InnerProduct, SparseCholesky, PartialCholesky, BlockDiagonal,
     # Formulations may build steps of other offline phases, and compiled programs.
     POD, Cone, Kind, Enrichment, CompiledModel, AffinePolynomial,
-    CertificateBase, ContactCompliance, OnlineInfSup, PreparedCorrections, ResidualBasis, SpectralBounds,
-    AnchorGrid, TermRanges, Constant,
+    CertificateBase, Constant, ContactCompliance, OnlineInfSup, PreparedCorrections, ResidualBasis, SpectralBounds,
+    AnchorGrid, TermRanges,
 )  # fmt: skip
 
 

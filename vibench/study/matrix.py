@@ -57,16 +57,8 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
         If the file cannot be read or is not a valid study; the message names the file, the key and the expected value.
     """
     path = find_study(request)
-    try:
-        # Without the byte-order mark of some editors, which TOML does not know.
-        text = read_regular(path).decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise RequestError(f"{path}: cannot be read as text: {error}") from None
-    try:
-        content = tomllib.loads(text)
-    # Syntax errors, but also numbers too long, and nesting too deep.
-    except (ValueError, RecursionError) as error:
-        raise RequestError(f"{path}: not valid TOML: {error}") from None
+    with placed(str(path)):
+        content = read_toml(path)
     given = {key: list(values) for key, values in (overrides or {}).items() if values}
     source = str(path) if path == Path(request) else f"study '{request}'"
     # The fault may be in either of them.
@@ -80,6 +72,20 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
         _anchor_options(kind, entry, path.absolute().parent)
     with placed(source):
         return Study.model_validate(content)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The content of a TOML file, or a `RequestError`."""
+    try:
+        # Without the byte-order mark of some editors, which TOML does not know.
+        text = read_regular(path).decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RequestError(f"cannot be read as text: {error}") from None
+    try:
+        return tomllib.loads(text)
+    # Syntax errors, but also numbers too long, and nesting too deep.
+    except (ValueError, RecursionError) as error:
+        raise RequestError(f"not valid TOML: {error}") from None
 
 
 def _tables(entries: Any) -> list[dict[str, Any]]:

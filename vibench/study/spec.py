@@ -337,6 +337,9 @@ class Study(_Model):
     tolerances: Annotated[list[ToleranceTable], MinLen(1)] = Field(
         description="Grids of tolerances; cells are their union."
     )
+    task: list[Literal["calibration"]] = Field(
+        default=[], description="What else a cell does: `calibration` walks Metropolis chains at three levels of noise."
+    )
     limits: Limits = Field(default=Limits(), description="Limits of a query and of a stage.")
 
     @model_validator(mode="wrap")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 benefit = Path(__file__).with_name("benefit.toml")
+calibration = Path(__file__).with_name("calibration.toml")
 certified = Path(__file__).with_name("certified.toml")
 default = Path(__file__).with_name("default.toml")
 field = Path(__file__).with_name("field.toml")

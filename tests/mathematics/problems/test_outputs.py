@@ -55,9 +55,18 @@ def test_the_forces_on_the_membrane_are_in_equilibrium() -> None:
     assert value(problem, "contact force", mu, found.u, found.lam) == pytest.approx(pressed, rel=1e-8)
 
 
-def test_the_deflection_is_that_of_a_node_half_way_to_the_edge() -> None:
-    problem = create("problem", "obstacle", {"resolution": "medium"})
-    nodes = problem.mesh.p[:, problem.free]
-    x = value(problem, "deflection", np.array([1.0, 0.0, 0.0]), nodes[0], np.zeros(problem.W.dim))
-    y = value(problem, "deflection", np.array([1.0, 0.0, 0.0]), nodes[1], np.zeros(problem.W.dim))
-    assert np.hypot(x - 0.35, y) < 0.03
+SENSORS = {
+    ("obstacle", "deflection"): (0.35, 0.0), ("obstacle", "left deflection"): (-0.35, 0.0),
+    ("obstacle", "lower deflection"): (0.0, -0.35), ("radial-obstacle", "inner deflection"): (0.25, 0.0),
+    ("radial-obstacle", "middle deflection"): (0.55, 0.0), ("radial-obstacle", "outer deflection"): (0.8, 0.0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("sensor", "place"), SENSORS.items(), ids=str)
+def test_a_deflection_is_that_of_the_node_nearest_to_its_place(
+    sensor: tuple[str, str], place: tuple[float, float]
+) -> None:
+    problem = create("problem", sensor[0], {"resolution": "medium"})
+    nodes, mu = problem.mesh.p[:, problem.free], problem.parameters.lower
+    x, y = (value(problem, sensor[1], mu, coordinates, np.zeros(problem.W.dim)) for coordinates in nodes)
+    assert np.hypot(x - place[0], y - place[1]) < 0.03

@@ -200,8 +200,10 @@ def test_runs_end_with_whether_they_pay_and_show_every_table_in_every_form(main:
         out = succeeded(main("show", str(quick_run), "--table", table, "--format", "csv"))
         rows = list(csv.DictReader(io.StringIO(out)))
         source = {"summary": "cells", "benefits": "thresholds"}.get(table, table)
-        assert len(rows) == len(read_table(quick_run / FILE, source)) > 0
-        if table == source:
+        assert len(rows) == len(read_table(quick_run / FILE, source))
+        # The study has no task.
+        assert rows or table == "calibrations"
+        if table == source and rows:
             assert [name for name in rows[0] if not name.startswith("mu_")] == list(STORED[table])
     for table in ("summary", "benefits", "cells"):
         lines = main("show", str(quick_run), "--table", table, "--format", "markdown")[1].splitlines()

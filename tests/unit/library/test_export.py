@@ -447,7 +447,8 @@ def test_the_command(run: vibench.Run, certified: bool, main: Main, tmp_path: Pa
     else:
         assert "B: 1 term, polynomials of degree (2, 0, 0)" in out
         assert "no error bounds: its cell has no bounds" in out
-        assert "outputs: deflection; code that the file cannot hold computes contact force, contact area\n" in out
+        held = "outputs: deflection, left deflection, lower deflection"
+        assert f"{held}; code that the file cannot hold computes contact force, contact area\n" in out
         refused(main(*asked), "model.npz' exists; remove it")
         refused(main(*asked[:-1], str(tmp_path / "b.npz"), "--tolerance", "1e-14"), "A depends on mu", "evaluations")
 
@@ -494,3 +495,11 @@ def test_the_code_of_the_page_runs(run: vibench.Run, tmp_path: Path, monkeypatch
             exec(code, found)
     assert found["solution"].status == "ok"
     monkeypatch.delitem(sys.modules, "reduced_model")
+
+
+def test_a_model_of_no_run_is_exported_with_the_name_of_its_problem_alone(run: vibench.Run, tmp_path: Path) -> None:
+    export_model(replace(model_of(run, "radial-obstacle"), row={}), tmp_path / "model.npz", c=True)
+    about = Exported(tmp_path / "model.npz").about
+    assert about["cell"] == {"problem": "Radial"}
+    assert about["source"] == {"distribution": "", "licence": "unknown"}
+    assert ": Radial.\n * Licence of the problem: unknown.\n" in (tmp_path / "model.h").read_text()

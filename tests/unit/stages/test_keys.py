@@ -17,6 +17,7 @@ from vibench.plugins import registry
 from vibench.stages import timing_rounds
 from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.base import ItemwiseStage, Result, Stage, build_problem
+from vibench.stages.calibration import CalibrationStage
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.stages.snapshots import fingerprint_here
@@ -53,7 +54,10 @@ def goals(study: Study) -> list[Stage]:
     cells = expand(study)
     ends = [cell_queries(cell, 20.0) for cell in cells]
     timing = TimingRounds(tuple(ends[:2]), ((0, 1),) * 2, 1, 0)
-    return [*ends, PictureStage(cells[0].problem, cells[0].training), timing]
+    # Chains take seconds: one study is enough.
+    bounded = [end for end in ends if end.bounds] if study is ADAPTIVE else []
+    chains = [CalibrationStage(end, "cell") for end in bounded[:1]]
+    return [*ends, *chains, PictureStage(cells[0].problem, cells[0].training), timing]
 
 
 def stages_of(study: Study) -> list[Stage]:

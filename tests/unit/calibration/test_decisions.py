@@ -1,0 +1,231 @@
+"""Decisions by bounds are those of the high-fidelity model; false bounds are caught; words say what is proved."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+import vibench
+from vibench.calibration.data import Data, Prior
+from vibench.calibration.decisions import BoundedSensors, Decisions, Prediction, RefutedError, Sensors
+from vibench.calibration.metropolis import Metropolis, summary
+from vibench.calibration.ranked import minimise
+from vibench.errors import RequestError
+from vibench.model.certificates.base import Guarantee
+from vibench.model.certificates.bounds import OnlineBound
+from vibench.qp.verification import QPSolution
+from vibench_problems.radial import Radial
+
+TRUTH = np.array([0.17, 0.1])
+NAMES = ("inner deflection", "middle deflection", "outer deflection")
+NUMBERS = st.floats(-10.0, 10.0)
+STEPS = 200
+
+
+@cache
+def radial() -> vibench.Model:
+    strategies = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
+    stops = vibench.Stop(tolerance=1e-3), vibench.Stop(tolerance=1e-2)
+    return vibench.Reduction(Radial("coarse"), *strategies, *stops, 0.5, assembly="reduced", bounds=True).model
+
+
+@cache
+def bounded() -> BoundedSensors:
+    return BoundedSensors(radial(), NAMES)
+
+
+@cache
+def data(noise: float) -> Data:
+    exact = Sensors(radial().problem, NAMES).high_fidelity()(TRUTH)
+    errors = np.random.default_rng(1).standard_normal(3)
+    return Data.independent(NAMES, exact * (1.0 + noise * errors), noise * np.abs(exact))
+
+
+def chain(
+    predict: Callable[[np.ndarray], Prediction] | None, noise: float, steps: int, audit: float = 0.01
+) -> Metropolis:
+    decisions = Decisions(radial().problem, data(noise), predict, audit, 0)
+    made = Metropolis(decisions, Prior.of(radial().parameters), steps // 5, 3)
+    while made.steps < steps:
+        made.step()
+    return made
+
+
+@cache
+def exact_chain(noise: float) -> Metropolis:
+    """That of the high-fidelity model."""
+    return chain(None, noise, STEPS)
+
+
+@given(
+    outputs=arrays(float, 3, elements=NUMBERS), share=arrays(float, 3, elements=st.floats(-1.0, 1.0)),
+    bounds=arrays(float, 3, elements=st.floats(0.0, 5.0)), root=arrays(float, (3, 3), elements=st.floats(-1.0, 1.0)),
+)  # fmt: skip
+def test_the_misfit_of_outputs_within_their_bounds_is_in_the_interval(
+    outputs: np.ndarray, share: np.ndarray, bounds: np.ndarray, root: np.ndarray
+) -> None:
+    covariance = root @ root.T + 0.1 * np.eye(3)
+    measured = Data(NAMES, np.array([1.0, 2.0, 3.0]), 0.5 * (covariance + covariance.T))
+    low, high = measured.interval(outputs, bounds)
+    apart = outputs + share * bounds - measured.values
+    misfit = 0.5 * apart @ np.linalg.solve(measured.covariance, apart)
+    assert low * (1.0 - 1e-9) - 1e-9 <= misfit <= high * (1.0 + 1e-9) + 1e-9
+    assert measured.interval(outputs, np.zeros(3)) == (measured.misfit(outputs),) * 2
+    assert measured.interval(outputs, np.array([0.0, np.inf, 0.0])) == (0.0, np.inf)
+
+
+def test_independent_noise_gives_the_interval_of_each_sensor_by_itself() -> None:
+    measured = Data.independent(("a", "b"), np.array([1.0, 0.0]), np.array([0.5, 2.0]))
+    assert measured.interval(np.array([3.0, 1.0]), np.array([1.0, 2.0])) == pytest.approx(
+        (0.5 * 4.0, 0.5 * (36 + 2.25))
+    )
+
+
+@pytest.mark.parametrize("noise", [0.03, 0.003])
+def test_chains_by_bounds_are_those_of_the_high_fidelity_model(noise: float) -> None:
+    exact, found = exact_chain(noise), chain(bounded(), noise, STEPS)
+    counts = found.decisions.counts
+    assert np.array_equal(found.states, exact.states)
+    assert found.decisions.claim == "exact"
+    assert counts.decisions == exact.decisions.counts.decisions
+    assert counts.undecided < 0.2 * counts.decisions
+    assert len(found.decisions.answers) < 0.5 * len(exact.decisions.answers)
+    assert 0.1 < found.accepted.mean() < 0.6
+
+
+def test_without_bounds_some_decisions_are_wrong_and_are_counted() -> None:
+    coarse = bounded()
+
+    def biased(mu: np.ndarray) -> Prediction:
+        outputs, bounds, guarantee = coarse(mu)
+        # a model that is a percent off, and knows it
+        return Prediction(1.01 * outputs, bounds + 0.01 * np.abs(outputs) + 1e-9, guarantee)
+
+    found = chain(biased, 0.003, STEPS)
+    assert found.decisions.counts.wrong > 0
+    assert np.array_equal(found.states, exact_chain(0.003).states)
+
+
+def test_a_false_certificate_is_caught_by_an_audit_which_names_the_parameter() -> None:
+    true = bounded()
+
+    def false(mu: np.ndarray) -> Prediction:
+        outputs, bounds, guarantee = true(mu)
+        return Prediction(outputs * 1.02, 1e-6 * bounds, guarantee)
+
+    # almost nothing is undecided, so that only audits ask
+    with pytest.raises(
+        RefutedError, match=r"the bounds are refuted at mu = \[0\.1\d+, 0\.\d+\]: the high-fidelity misfit"
+    ):
+        chain(false, 0.01, 400, audit=0.05)
+    unheard = chain(false, 0.01, 30, audit=0.0)
+    assert not unheard.decisions.answers
+
+
+def test_verified_bounds_are_said_to_be_without_contradiction_only() -> None:
+    true = bounded()
+    found = chain(lambda mu: true(mu)._replace(guarantee=Guarantee.VERIFIED), 0.01, 60, audit=0.2)
+    assert found.decisions.counts.audits > 3
+    assert found.decisions.claim == f"no contradiction in {found.decisions.counts.audits} audits"
+
+
+def test_bounds_allow_for_the_accuracy_of_high_fidelity_solutions() -> None:
+    outputs, bounds, guarantee = bounded()(TRUTH)
+    solution = radial().solve(TRUTH)
+    alone = np.array([solution.output_bounds[name] for name in NAMES])
+    np.testing.assert_allclose(outputs, [solution.outputs[name] for name in NAMES], rtol=1e-12)
+    assert guarantee is Guarantee.CERTIFIED
+    # by 3 √ε of the force, which is about that of the whole contact
+    assert ((bounds > alone) & (bounds < alone + 1e-3 * np.abs(outputs))).all()
+    exact = Sensors(radial().problem, NAMES).high_fidelity()(TRUTH)
+    assert (np.abs(exact - outputs) <= bounds).all()
+
+
+def test_where_there_is_no_bound_the_high_fidelity_model_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = chain(bounded(), 0.01, 20)
+    predict = BoundedSensors(radial(), NAMES)
+    # the certificate finds no bound, or the solver no solution
+    monkeypatch.setattr(predict, "certificate", SimpleNamespace(certify=lambda *_: (OnlineBound.none("why"), None)))
+    without = chain(predict, 0.01, 20)
+    monkeypatch.setattr("vibench.offline.models.solve_qp", lambda *_: QPSolution(None, None, "failed"))
+    for other in (without, chain(predict, 0.01, 20)):
+        assert other.decisions.counts.undecided == other.decisions.counts.decisions > 0
+        assert other.decisions.claim == "exact"
+        assert np.array_equal(other.states, found.states)
+
+
+def test_what_has_no_bound_is_refused() -> None:
+    with pytest.raises(RequestError, match="no output of the problem is called 'deflection'"):
+        BoundedSensors(radial(), ("deflection",))
+    with pytest.raises(RequestError, match="the model has no error bounds"):
+        BoundedSensors(replace(radial(), certificate=None), NAMES)
+    with pytest.raises(RequestError, match=r"audit of Decisions is 2\.0, expected a number from 0 to 1"):
+        Decisions(radial().problem, data(0.01), None, 2.0, 0)
+
+
+def test_cma_on_ranks_takes_the_path_of_the_high_fidelity_model() -> None:
+    pytest.importorskip("cma")
+    box, measured = radial().parameters, data(0.003)
+    found, exact = (
+        minimise(Decisions(radial().problem, measured, predict, 0.01, 0), box, seed=4, iterations=8, tolx=1e-4)
+        for predict in (bounded(), None)
+    )
+    assert np.array_equal(found[0], exact[0])
+    assert np.array_equal(found[1], exact[1])
+    longer = minimise(Decisions(radial().problem, measured, bounded(), 0.01, 0), box, seed=4, iterations=40, tolx=1e-4)
+    outputs = Sensors(radial().problem, NAMES).high_fidelity()(longer[0])
+    assert (np.abs(outputs - measured.values) < 2.0 * np.sqrt(np.diag(measured.covariance))).all()
+
+
+def test_earlier_answers_lead_to_the_same_chain_without_questions() -> None:
+    whole = chain(bounded(), 0.003, STEPS)
+    again = Decisions(radial().problem, data(0.003), bounded(), 0.01, 0)
+    again.earlier = dict(whole.decisions.answers)
+    again._solved = None  # type: ignore[method-assign, assignment]  nothing is asked
+    made = Metropolis(again, whole.prior, whole.burn_in, 3)
+    while made.steps < STEPS:
+        made.step()
+    assert np.array_equal(made.states, whole.states)
+    assert again.answers == whole.decisions.answers
+    assert replace(again.counts, model_seconds=0.0) == replace(whole.decisions.counts, model_seconds=0.0)
+
+
+def test_outside_the_box_nothing_is_claimed() -> None:
+    decisions = Decisions(radial().problem, data(0.01), bounded(), 0.01, 0)
+    outside = radial().parameters.upper + 0.001
+    assert (decisions.interval(outside).lower, decisions.interval(outside).upper) == (0.0, np.inf)
+    assert decisions.interval(TRUTH).upper < np.inf
+
+
+def test_the_posterior_is_that_of_the_closed_form() -> None:
+    problem, measured = radial().problem, data(0.1)
+    radii = [float(np.linalg.norm(problem.mesh.p[:, problem.free] @ output.u)) for output in problem.outputs]
+    grid = problem.parameters.grid(81, 81)
+    logs = np.array([-measured.misfit(problem.exact(mu).u(np.array(radii))) for mu in grid])
+    # the trapezoidal rule on the box
+    inside = np.where(np.isin(grid, [problem.parameters.lower, problem.parameters.upper]), 0.5, 1.0).prod(axis=1)
+    weights = inside * np.exp(logs - logs.max())
+    mean = weights @ grid / weights.sum()
+    sd = np.sqrt(weights @ (grid - mean) ** 2 / weights.sum())
+    found = summary(chain(bounded(), 0.1, 2000))
+    errors = found["error of mean"].to_numpy()
+    assert (found["effective steps"] > 100).all()
+    # a chance of 1e-4 for each mean; deviations have about the same relative error
+    assert (np.abs(found["mean"] - mean) < 4.0 * errors).all()
+    np.testing.assert_allclose(found["sd"], sd, rtol=4.0 * float((errors / found["sd"]).max()))
+
+
+def test_a_normal_prior_is_truncated_to_the_box() -> None:
+    box = radial().parameters
+    prior = Prior.of(box, {"height": (0.5, 0.1)})
+    inside = np.array([0.15, 0.1]), np.array([0.2, 0.2])
+    assert prior.log_density(inside[1]) - prior.log_density(inside[0]) == pytest.approx(0.5 * (3.5**2 - 3.0**2))
+    assert prior.log_density(np.array([0.21, 0.1])) == -np.inf
+    with pytest.raises(RequestError, match="no parameter is called 'depth'"):
+        Prior.of(box, {"depth": (0.0, 1.0)})

@@ -1,0 +1,188 @@
+"""Measured data, their noise, and the prior of the parameters: what a calibration is given."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import scipy.linalg
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+
+from vibench.arrays import Array
+from vibench.errors import RequestError, fault_line, placed, unknown_name
+from vibench.interfaces.outputs import Output
+from vibench.interfaces.parameters import ParameterBox, outside
+from vibench.interfaces.problem import Problem
+from vibench.signatures import constructed
+from vibench.study.matrix import read_toml
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class _Sensor(_Table):
+    value: FiniteFloat
+    noise: FiniteFloat | str | None = None
+    unit: str | None = None
+
+
+class _Normal(_Table):
+    mean: FiniteFloat
+    sd: Annotated[FiniteFloat, Field(gt=0.0)]
+
+
+class _File(_Table):
+    sensors: Annotated[dict[str, _Sensor], Field(min_length=1)]
+    covariance: list[list[FiniteFloat]] | None = None
+    prior: dict[str, _Normal] = {}
+
+
+@constructed
+@dataclass(frozen=True)
+class Data:
+    """Measured values d of outputs, with normal noise.
+
+    Attributes
+    ----------
+    sensors
+        Names of the outputs, one for each value.
+    values
+        d (k,), in the units of the outputs.
+    covariance
+        That of the noise (k×k); a `RequestError` if it is not symmetric positive definite.
+    """
+
+    sensors: Annotated[tuple[str, ...], "k"]
+    values: Annotated[Array, "k"]
+    covariance: Annotated[Array, "k", "k"]
+
+    def __post_init__(self) -> None:
+        try:
+            root = np.linalg.cholesky(self.covariance)
+        except np.linalg.LinAlgError:
+            raise RequestError("the covariance of the noise is not positive definite") from None
+        if not np.allclose(self.covariance, self.covariance.T, rtol=1e-12, atol=0.0):
+            raise RequestError("the covariance of the noise is not symmetric")
+        whitening = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True)
+        object.__setattr__(self, "_whitening", whitening)
+
+    @classmethod
+    def independent(cls, sensors: Sequence[str], values: Array, noise: Array) -> Data:
+        """Data whose errors are independent, with the standard deviations `noise` (k,)."""
+        return cls(tuple(sensors), np.asarray(values, float), np.diag(np.asarray(noise, float) ** 2))
+
+    def misfit(self, outputs: Array) -> float:
+        """½ (s − d)ᵀ C⁻¹ (s − d) of outputs s (k,): the negative logarithm of the likelihood, up to a constant."""
+        return self.interval(outputs, np.zeros(len(outputs)))[0]
+
+    def interval(self, outputs: Array, bounds: Array) -> tuple[float, float]:
+        """The least and the largest misfit that outputs (k,) with errors within `bounds` (k,) may have."""
+        if not np.isfinite(bounds).all():
+            return 0.0, np.inf
+        whitening: Array = self._whitening  # type: ignore[attr-defined]
+        # With C = LLᵀ, each component of L⁻¹(s − d) moves by at most the sum of |L⁻¹| times the bounds.
+        size, reach = np.abs(whitening @ (outputs - self.values)), np.abs(whitening) @ bounds
+        least = np.maximum(size - reach, 0.0)
+        return 0.5 * float(least @ least), 0.5 * float((size + reach) @ (size + reach))
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The prior on a parameter box: normal and truncated to the box, uniform where the deviation `sd` is infinite."""
+
+    box: ParameterBox
+    mean: Array
+    sd: Array
+
+    @classmethod
+    def of(cls, box: ParameterBox, normal: Mapping[str, tuple[float, float]] = {}) -> Prior:
+        """The prior that is normal in the named components, with these means and standard deviations."""
+        mean, sd = 0.5 * (box.lower + box.upper), np.full(box.dim, np.inf)
+        for name, pair in normal.items():
+            i = box.index(name)
+            mean[i], sd[i] = pair
+        return cls(box, mean, sd)
+
+    def log_density(self, mu: Array) -> float:
+        """Its logarithm at mu (d,), up to a constant; −∞ outside the box."""
+        if outside(self.box, mu).any():
+            return -np.inf
+        return -0.5 * float(np.sum(((mu - self.mean) / self.sd) ** 2))
+
+
+def read_data(path: Path, problem: Problem) -> tuple[Data, Prior]:
+    """The data and the prior of a TOML file; a `RequestError` names the file, the key and what would be right."""
+    with placed(str(path)):
+        content = read_toml(path)
+        try:
+            file = _File.model_validate(content)
+        except ValidationError as fault:
+            raise RequestError(fault_line(fault, _File)) from None
+        known, values = {output.name: output for output in problem.outputs}, []
+        for name, sensor in file.sensors.items():
+            if name not in known:
+                raise unknown_name("output of the problem", name, known)
+            if sensor.unit not in (None, known[name].unit):
+                raise RequestError(f"sensors.{name}.unit is '{sensor.unit}', the output has '{known[name].unit}'")
+            values.append(sensor.value)
+        prior = Prior.of(problem.parameters, {name: (one.mean, one.sd) for name, one in file.prior.items()})
+        if file.covariance is None:
+            noise = np.array([_deviation(name, sensor) for name, sensor in file.sensors.items()])
+            return Data.independent(tuple(file.sensors), np.array(values), noise), prior
+        if [len(row) for row in file.covariance] != [len(values)] * len(values):
+            raise RequestError(f"covariance has not the shape ({len(values)}, {len(values)}) of the sensors")
+        if twice := [name for name, sensor in file.sensors.items() if sensor.noise is not None]:
+            raise RequestError(f"sensors.{twice[0]}.noise: with a covariance the sensors have no noise of their own")
+        return Data(tuple(file.sensors), np.array(values), np.array(file.covariance, float)), prior
+
+
+def _deviation(name: str, sensor: _Sensor) -> float:
+    found = sensor.noise
+    if isinstance(found, str):
+        with placed(f"sensors.{name}.noise"):
+            found = share(found) * abs(sensor.value)
+    if found is None or not found > 0.0:
+        raise RequestError(f"sensors.{name}.noise: expected a standard deviation, or a share of a value that is not 0")
+    return found
+
+
+def share(text: str) -> float:
+    """The number of a text such as "1 %"; a `RequestError` if it is no positive percentage."""
+    found = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*%\s*", text)
+    if found is None or not float(found[1]) > 0.0:
+        raise RequestError(f"{text!r} is no positive percentage, such as 1%")
+    return float(found[1]) / 100.0
+
+
+def synthetic(sensors: Sequence[str], exact: Array, noise: float, seed: int) -> Data:
+    """Exact values (k,) with random errors, whose deviations are a share of these values."""
+    deviations = noise * np.abs(exact)
+    values = exact + deviations * np.random.default_rng(seed).standard_normal(len(exact))
+    return Data.independent(sensors, values, deviations)
+
+
+def as_toml(data: Data, outputs: Sequence[Output]) -> str:
+    """The file of data with independent errors, of these outputs."""
+    lines = []
+    for output, value, square in zip(outputs, data.values.tolist(), np.diag(data.covariance).tolist(), strict=True):
+        name, unit = (json.dumps(text, ensure_ascii=False) for text in (output.name, output.unit))
+        lines += [f"[sensors.{name}]", f"value = {value!r}", f"noise = {square**0.5!r}", f"unit = {unit}", ""]
+    return "\n".join(lines)
+
+
+def refuse_unreachable(data: Data, reached: Sequence[Array]) -> None:
+    """Raise a `RequestError` for a value far from all that its sensor has at training parameters, `reached` (k×P)."""
+    deviations = np.sqrt(np.diag(data.covariance))
+    for name, value, noise, values in zip(data.sensors, data.values, deviations, reached, strict=True):
+        low, high = float(values.min()), float(values.max())
+        # The box may reach a little farther than the training parameters do.
+        slack = 0.1 * (high - low) + 5.0 * noise
+        if not low - slack <= value <= high + slack:
+            found = f"'{name}' is {value:.4g}, and the parameter box gives {low:.4g} to {high:.4g}"
+            raise RequestError(f"{found}; is the unit right?")

@@ -1,0 +1,315 @@
+"""Decisions of a calibration, taken where error bounds prove them, and by the high-fidelity model elsewhere.
+
+Bounds of outputs give an interval of the misfit. Whether one parameter fits better than another is decided where their
+intervals are apart; otherwise the high-fidelity model is asked. A method that consists of such decisions takes the path
+of the high-fidelity model, step by step.
+
+**The accuracy of the high-fidelity solution.** Bounds are distances from the exact solution (u, λ), decisions those of
+the computed one (û, λ̂). Let r = f − Aû − Bᵀλ̂, s = Bû − g, d = û − u, and let U be the unit of its natural residuals,
+which are at most ε (`Sensors.accuracy`). In the norms of A and A⁻¹ (`vibench.qp.verification`)
+
+    ‖r‖ ≤ εU,    (s_i)₊ ≤ εU ‖B_i‖,    |λ̂ᵀs| ≤ εU²,    U ≤ max(‖Bᵀλ‖, √(‖û‖² + ‖Bᵀλ̂‖²)).
+
+Let d_i ≥ ‖B_i‖, P ≥ ‖u‖ and P ≥ Σ λ_i d_i ≥ ‖Bᵀλ‖. The difference solves A d + Bᵀ(λ̂ − λ) = −r; its product with d,
+λ̂ᵀ(Bu − g) ≤ 0 and λᵀ(Bu − g) = 0 give
+
+    ‖d‖² ≤ ‖d‖ ‖r‖ + |λ̂ᵀs| + λᵀ(s)₊ ≤ ε (U ‖d‖ + U² + UP),    ‖Bᵀ(λ̂ − λ)‖ ≤ D := ‖d‖ + εU.
+
+Since U ≤ √2 (P + D), the first line is at most (2 + √2) ε (P + D)². Hence D ≤ 1.85 √ε (P + D), and D ≤ 1.86 √ε P.
+Both errors are thus at most δ = 2 √ε P, and round-off is small beside the rest of the factor 2:
+- Verification passes a violation below the round-off of its row, which has b entries. It is at most 3 (b + 2) 2⁻⁵² d_i
+  times ‖û‖ where d_i bounds Σ_j |B_ij| ‖e_j‖, as below: ε is at least 3 (b + 2) 2⁻⁵² here.
+- It may judge λ̂ with A⁻¹(f − Bᵀλ̂) in place of û. These differ by at most 64 · 2⁻⁵² √(|û|ᵀ|A||û|), or 1e-14 √(k/σ) ‖û‖
+  for k entries in a row of X ≽ σ diag(X) at γ = α: less than √ε/10 ‖û‖ down to σ = 1e-12.
+- Outputs and misfits are sums of at most n products.
+Opposite rows, whose gaps verification leaves out, have β = 0, and no bounds here.
+
+P follows from the reduced solution: ‖u‖ ≤ ‖u_N‖ + Δ_u, and with W ≽ σ diag(W)
+
+    Σ λ_i d_i ≤ Σ λ_N,i d_i + √(Σ d_i²/(σ W_ii)) ‖λ − λ_N‖_W.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import inf, sqrt
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from cachetools import LRUCache
+
+from vibench.arrays import Array, SparseMatrix, is_sound
+from vibench.calibration.data import Data
+from vibench.errors import NumericalError, RequestError, unknown_name
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.formulations import FormulationAnswer
+from vibench.interfaces.parameters import outside
+from vibench.interfaces.problem import Problem
+from vibench.linalg import EPS
+from vibench.model.bound_terms import CorrectionMode
+from vibench.model.certificates.base import Guarantee, output_coefficients, output_weights
+from vibench.model.certificates.bounds import OnlineBound, output_error_bound
+from vibench.model.galerkin import Evaluated, contact_at
+from vibench.model.hyperreduced import HyperReducedModel
+from vibench.offline.models import Model
+from vibench.qp.verification import QPSolution
+from vibench.signatures import Rule, Seed, constructed
+from vibench.stability.coercivity import share_of_diagonal
+from vibench.timing import timed
+
+
+class RefutedError(NumericalError):
+    """A high-fidelity solution contradicts the bounds: decisions that rest on them prove nothing."""
+
+
+class Prediction(NamedTuple):
+    """Outputs (k,) of a reduced model, bounds (k,) of their distances from the high-fidelity ones, and their worth."""
+
+    outputs: Array
+    bounds: Array
+    guarantee: Guarantee
+
+    @classmethod
+    def without_bounds(cls, outputs: Array) -> Prediction:
+        """Nothing is known, and nothing is claimed: the high-fidelity model is asked."""
+        return cls(outputs, np.full(len(outputs), inf), Guarantee.CERTIFIED)
+
+
+Predict = Callable[[Array], Prediction]
+
+
+class Sensors:
+    """Outputs of a problem by their names; a `RequestError` if there is no such output.
+
+    High-fidelity solutions are as accurate as bounds allow for: their natural residuals are at most `accuracy`.
+    """
+
+    # A hundredth of what is verified elsewhere, and a hundred times what is usual: bounds grow by twice its root.
+    accuracy = 1e-12
+
+    def __init__(self, problem: Problem, names: tuple[str, ...]) -> None:
+        known = {output.name: output for output in problem.outputs}
+        for name in names:
+            if name not in known:
+                raise unknown_name("output of the problem", name, known)
+        self.problem, self.outputs = problem, tuple(known[name] for name in names)
+
+    def high_fidelity(self) -> Callable[[Array], Array]:
+        """From mu (d,) to the outputs (k,) of the high-fidelity solution; a `NumericalError` if it is less accurate."""
+        solver = HighFidelitySolver(self.problem)
+
+        def ask(mu: Array) -> Array:
+            found = solver.solve(mu)
+            if not found.residuals.worst <= self.accuracy:
+                left = f"{found.residuals.worst:.1e} at mu = {mu.tolist()}, above {self.accuracy:.0e}"
+                raise NumericalError(f"the high-fidelity solution has the natural residual {left}")
+            return np.array([one.values(mu[None], found.u[:, None], found.lam[:, None])[0] for one in self.outputs])
+
+        return ask
+
+
+class BoundedSensors:
+    """Outputs of a reduced model with proved or verified bounds.
+
+    Raises a `RequestError` if the model has no bounds, an output is not linear, or no inf-sup constant is proved.
+    """
+
+    def __init__(self, model: Model, names: tuple[str, ...]) -> None:
+        problem, outputs = model.problem, Sensors(model.problem, names).outputs
+        if model.certificate is None:
+            raise RequestError("the model has no error bounds: a calibration needs one with bounds = true")
+        self.model, self.certificate, self.base = model, model.certificate, model.certificate.base
+        for output in outputs:
+            if not output.linear:
+                linear = ", ".join(one.name for one in problem.outputs if one.linear)
+                raise RequestError(f"'{output.name}' is no linear output, and has no bound; linear: {linear or 'none'}")
+        share = share_of_diagonal(problem.W)
+        if not (self.base.inf_sup.value > 0.0 and share.proved and share.value > 0.0):
+            raise RequestError(f"λ has no bound, which the accuracy of solutions needs: {self.base.inf_sup.note}")
+        self._mass = share.value * problem.W.matrix.diagonal()
+        self._root = np.sqrt((1.0 + self.base.compliance_error) * np.diag(self.base.compliance))
+        # Where B(µ) is θ(µ) B₀ it need not be assembled.
+        self._is_scaled, self._reach = self.base.bound_terms is not None, self._lengths(self.base.constraint)
+        self._weights = [output_weights(problem, self.base, output) for output in outputs]
+        of_u, of_lam = map(np.array, zip(*(output_coefficients(problem, output) for output in outputs), strict=True))
+        reduced, self._of_alpha = model.reduced, of_lam @ model.reduced.generators
+        assert isinstance(reduced, HyperReducedModel)  # as certificates need it
+        self._of_y = of_u @ reduced.basis
+
+    def __call__(self, mu: Array) -> Prediction:
+        """The outputs at mu (d,), with bounds that allow for the accuracy of the high-fidelity solution."""
+        model, problem = self.model, self.model.problem
+        assembled, (settings, solver) = model.online.program(mu), model.settings()
+        answer: FormulationAnswer | QPSolution
+        if model.solver is None:
+            answer = model.online.solve(mu, settings)
+        else:
+            answer = solver(assembled.program, factor=assembled.factor)
+        # Bounds hold for any pair: how well it solves the program shows in their size alone.
+        if answer.x is None or answer.alpha is None or not (is_sound(answer.x) and is_sound(answer.alpha)):
+            return Prediction.without_bounds(np.zeros(len(self._weights)))
+        x, alpha = answer.x, np.maximum(answer.alpha, 0.0)
+        outputs = self._of_y @ assembled.evaluated.in_space(x) + self._of_alpha @ alpha
+        if not self._is_scaled and assembled.evaluated.contact is None:
+            # Evaluated once for the bounds and the accuracy.
+            assembled = replace(assembled, evaluated=replace(assembled.evaluated, contact=contact_at(problem, mu)))
+        bound, _ = self.certificate.certify(problem, mu, assembled, x, alpha, CorrectionMode.NONE)
+        delta = self._distance_of_computed(assembled.evaluated, model.reduced.generators @ alpha, bound)
+        if not delta < inf:
+            return Prediction.without_bounds(outputs)
+        widened = replace(bound, u_energy=bound.u_energy + delta, lam=bound.lam + delta / bound.inf_sup)
+        bounds = [output_error_bound(weights, self.base, widened) for weights in self._weights]
+        return Prediction(outputs, np.array(bounds), bound.guarantee)
+
+    def _distance_of_computed(self, evaluated: Evaluated, lam: Array, bound: OnlineBound) -> float:
+        """The δ of a reduced solution with the multiplier λ_N = `lam` (m,) and these bounds."""
+        # The relative bound is Δ_u over a lower bound of ‖u‖; there is none of a solution without energy.
+        if not (bound.lam < inf and 0.0 < bound.relative < inf):
+            return inf
+        theta, (d, entries) = 1.0, self._reach
+        if self._is_scaled:
+            theta = abs(float(evaluated.samples.get("B", self.base.one)[0]))
+        elif evaluated.contact is not None:
+            d, entries = self._lengths(evaluated.contact.B)
+        d = d * (theta / sqrt(bound.coercivity))
+        force = float(d @ lam) + sqrt(float(d @ (d / self._mass))) * bound.lam
+        # A tenth more for the round-off in ‖u_N‖.
+        size = 1.1 * (bound.u_energy / bound.relative + 2.0 * bound.u_energy)
+        return 2.0 * sqrt(max(Sensors.accuracy, 3.0 * EPS * (entries + 2.0))) * max(force, size)
+
+    def _lengths(self, B: SparseMatrix) -> tuple[Array, int]:
+        """The sums Σ_j |B_ij| ‖e_j‖ (m,) in the norm of X⁻¹, and the largest number of entries of a row."""
+        B = sp.csr_array(B)
+        counts, sizes = np.diff(B.indptr), np.abs(B.data) * self._root.take(B.indices)
+        sums = np.bincount(np.repeat(np.arange(len(counts)), counts), sizes, len(counts))
+        return np.asarray(sums, float), int(counts.max())
+
+
+@dataclass(eq=False)
+class Interval:
+    """Bounds of the misfit at a parameter, which are equal once the high-fidelity model was asked."""
+
+    lower: float
+    upper: float
+    # The misfit of the reduced model, by which decisions without bounds are taken.
+    middle: float
+
+    def below(self, other: Interval, shift: float) -> bool | None:
+        """Whether this misfit is less than the other one plus a shift; `None` if the intervals do not decide."""
+        if self.upper < other.lower + shift:
+            return True
+        return False if self.lower >= other.upper + shift else None
+
+
+@dataclass
+class Counts:
+    """Decisions, those that bounds left open, audits, decisions that the reduced model takes wrongly without bounds."""
+
+    decisions: int
+    undecided: int
+    audits: int
+    wrong: int
+    # CPU seconds of the reduced model.
+    model_seconds: float
+
+
+@constructed
+class Decisions:
+    """Whether a parameter fits data better than another one, as the high-fidelity model says.
+
+    Parameters
+    ----------
+    problem, data
+        The problem, and the data that its outputs are compared with.
+    predict
+        Outputs with bounds, as of `BoundedSensors`; `None` asks the high-fidelity model always.
+    audit
+        Share of the decided decisions, drawn at random, for which the high-fidelity model is asked all the same.
+    seed
+        The seed of this draw.
+    """
+
+    def __init__(
+        self, problem: Problem, data: Data, predict: Predict | None,
+        audit: Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)], seed: Seed,
+    ) -> None:  # fmt: skip
+        self.data, self.counts, self.guarantee = data, Counts(0, 0, 0, 0, 0.0), Guarantee.CERTIFIED
+        self._box, self._predict = problem.parameters, predict
+        self._ask = Sensors(problem, data.sensors).high_fidelity()
+        self._audit, self._random = audit, np.random.default_rng(seed)
+        # Misfit and CPU seconds of the high-fidelity model by the bytes of the parameter: all that were asked, and
+        # those that an interrupted run has asked before.
+        self.answers: dict[bytes, tuple[float, float]] = {}
+        self.earlier: dict[bytes, tuple[float, float]] = {}
+        # Methods compare with what they saw last.
+        self._recent: LRUCache[bytes, Interval] = LRUCache(1000)
+
+    def interval(self, mu: Array) -> Interval:
+        """Bounds of the misfit at mu (d,), ½ (s − d)ᵀ C⁻¹ (s − d); minus that is the log-likelihood."""
+        key = mu.tobytes()
+        if (known := self._recent.get(key)) is None:
+            known = self._recent[key] = self._estimated(mu)
+            if key in self.answers:
+                known.lower = known.upper = self.answers[key][0]
+        return known
+
+    def _estimated(self, mu: Array) -> Interval:
+        # Bounds are claimed in the box alone.
+        if (predict := self._predict) is None or outside(self._box, mu).any():
+            return Interval(0.0, inf, 0.0)
+        (outputs, bounds, guarantee), seconds = timed(lambda: predict(mu))
+        self.counts.model_seconds += seconds.cpu
+        if guarantee is not Guarantee.CERTIFIED:
+            self.guarantee = Guarantee.VERIFIED
+        return Interval(*self.data.interval(outputs, bounds), self.data.misfit(outputs))
+
+    def ask(self, mu: Array) -> float:
+        """The misfit of the high-fidelity model at mu (d,), which is kept; a `RefutedError` if bounds exclude it."""
+        key, known = mu.tobytes(), self.interval(mu)
+        if key not in self.answers:
+            misfit, seconds = self.earlier[key] if key in self.earlier else self._solved(mu)
+            if not known.lower <= misfit <= known.upper:
+                found = f"the high-fidelity misfit {misfit:.6g} is not between {known.lower:.6g} and {known.upper:.6g}"
+                raise RefutedError(f"the bounds are refuted at mu = {mu.tolist()}: {found}")
+            self.answers[key] = misfit, seconds
+        known.lower = known.upper = self.answers[key][0]
+        return known.lower
+
+    def _solved(self, mu: Array) -> tuple[float, float]:
+        outputs, seconds = timed(lambda: self._ask(mu))
+        return self.data.misfit(outputs), seconds.cpu
+
+    def less(self, a: Array, b: Array, shift: float = 0.0) -> bool:
+        """Whether the high-fidelity misfit at a (d,) is less than that at b (d,) plus a shift.
+
+        Raises a `RefutedError` if an answer of the high-fidelity model contradicts the bounds.
+        """
+        one, other = self.interval(a), self.interval(b)
+        verdict = one.below(other, shift)
+        self.counts.decisions += 1
+        if verdict is None:
+            self.counts.undecided += 1
+            # Later decisions compare with b again, the present state of a chain: it is asked first.
+            for mu in (b, a):
+                self.ask(mu)
+                if (verdict := one.below(other, shift)) is not None:
+                    break
+        elif self._predict is not None and self._random.random() < self._audit:
+            self.counts.audits += 1
+            self.ask(a)
+            self.ask(b)
+        self.counts.wrong += bool(self._predict is not None and (one.middle < other.middle + shift) != verdict)
+        return bool(verdict)
+
+    @property
+    def seconds(self) -> float:
+        """CPU seconds of all queries and questions."""
+        return self.counts.model_seconds + sum(seconds for _, seconds in self.answers.values())
+
+    @property
+    def claim(self) -> str:
+        """The claim that the bounds of the decisions so far allow."""
+        is_exact = self.guarantee is Guarantee.CERTIFIED
+        return "exact" if is_exact else f"no contradiction in {self.counts.audits} audits"

@@ -1,0 +1,77 @@
+"""The task "calibration" of a study: what decisions of a chain cost a cell, and what they would be without bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vibench.calibration.data import Prior, synthetic
+from vibench.calibration.decisions import BoundedSensors, Decisions, Predict, Prediction, Sensors
+from vibench.calibration.metropolis import Metropolis
+from vibench.errors import NumericalError
+from vibench.offline.models import Model
+from vibench.stages.artefacts import Store
+from vibench.stages.base import Result, Row, Stage
+from vibench.stages.cell_queries import CellQueries
+from vibench.timing import timed
+
+
+@dataclass(frozen=True)
+class CalibrationStage(Stage):
+    """Metropolis chains by the model of a cell, at three levels of noise; the value is a row for each."""
+
+    label = "calibration"
+
+    queries: CellQueries
+    # Key of the cell.
+    cell: str
+
+    @property
+    def packages(self) -> frozenset[str]:
+        return self.queries.packages
+
+    @property
+    def effort(self) -> float:
+        # Of three chains a model without bounds asks every step.
+        return 1200.0 if self.queries.certificate is None else 200.0
+
+    def inputs(self) -> tuple[Stage, ...]:
+        return self.queries.model_inputs
+
+    def run(self, store: Store) -> Result:
+        model, seed = self.queries.bounded_model(store), self.queries.validation_set.seed
+        problem, box = model.problem, model.parameters
+        sensors = tuple(output.name for output in problem.outputs if output.linear)
+        if not sensors:
+            raise NumericalError("the problem has no linear outputs, which sensors have to be")
+        predict = _unbounded(model, sensors) if model.certificate is None else BoundedSensors(model, sensors)
+        ask, truth = Sensors(problem, sensors).high_fidelity(), box.sample(1, seed)[0]
+        exact, solution = timed(lambda: ask(truth))
+        rows: list[Row] = []
+        for noise in (0.03, 0.01, 0.003):
+            decisions = Decisions(problem, synthetic(sensors, exact, noise, seed), predict, 0.01, seed)
+            # As many steps as show a decision in a hundred.
+            chain = Metropolis(decisions, Prior.of(box), 100, seed)
+            while chain.steps < 400:
+                chain.step()
+            counts = decisions.counts
+            solved = [seconds for _, seconds in decisions.answers.values()] or [solution.cpu]
+            rows.append({
+                "noise": noise, "steps": chain.steps, "decisions": counts.decisions,
+                "asked": counts.undecided / max(counts.decisions, 1), "questions": len(decisions.answers),
+                "audits": counts.audits, "wrong": counts.wrong, "claim": decisions.claim,
+                # The high-fidelity chain solves at every decision, and at its start.
+                "calibration_s": decisions.seconds, "hf_chain_s": float(np.mean(solved)) * (counts.decisions + 1),
+            })  # fmt: skip
+        return Result(tuple(rows))
+
+
+def _unbounded(model: Model, sensors: tuple[str, ...]) -> Predict:
+    """The outputs of a model without bounds: every decision is asked, and the wrong ones are counted."""
+
+    def predict(mu: np.ndarray) -> Prediction:
+        outputs = model.solve(mu).outputs
+        return Prediction.without_bounds(np.array([outputs[name] for name in sensors], float))
+
+    return predict
