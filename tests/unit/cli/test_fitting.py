@@ -47,7 +47,7 @@ def test_every_table_of_a_run_fits(table: str, main: Main, quick_run: Path, monk
         shown = out.split("\n", 1)[1].split("not shown")[0].replace(",", " ")
         words = {word for word in shown.split() if re.search(r"\d", word)}
         assert words - whole - {str(width)} == set()
-        assert len(words) > 3
+        assert len(words) > 3 or table == "calibrations"  # which no task of `quick` makes
 
 
 numbers = st.floats(1e-12, 1e12, allow_nan=False)
