@@ -45,11 +45,14 @@ class IsolatedCall(ItemwiseStage, Items):
     """
 
     label = "call"
-    items = 1
 
     pickled: bytes
     path: tuple[str, ...]
     owners: tuple[str, ...]
+
+    @property
+    def items(self) -> int:
+        return 1
 
     @property
     def packages(self) -> frozenset[str]:

@@ -158,6 +158,8 @@ class _JobState:
 
     # Seconds of the start of a worker process and its imports; on a busy machine that may exceed the limit of a job.
     start_seconds = 300.0
+    # Seconds beyond the limit of a query, for the work before and after the solver.
+    grace = 2.0
 
     def __init__(self, job: Job) -> None:
         self.job, self.progress = job, Progress()
@@ -196,8 +198,7 @@ class _JobState:
         # An operation has begun or ended since the last call.
         if changes != self._changes:
             self._changes = changes
-            # Two seconds are for the work before and after the solver.
-            self._item_limit = self.seconds + self.job.query_seconds + 2.0 if limited else float("inf")
+            self._item_limit = self.seconds + self.job.query_seconds + self.grace if limited else float("inf")
         if self.seconds > limit:
             raise _WorkerLostError(_beyond("cell_seconds", self.job.cell_seconds))
         if self.seconds > self._item_limit:

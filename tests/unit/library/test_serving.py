@@ -17,6 +17,7 @@ from samples import with_ways
 
 import vibench
 from vibench.library.serving import ModelServer
+from vibench_problems.obstacle import Obstacle
 
 umbridge = pytest.importorskip("umbridge")
 
@@ -50,7 +51,7 @@ def test_a_client_finds_the_answers_and_bounds_of_the_model(
     server: ModelServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model, client = server.model, client_of(server)
-    assert (client.get_input_sizes(), client.get_output_sizes()) == ([3], [3, 3])
+    assert (client.get_input_sizes(), client.get_output_sizes()) == ([3], [len(server.outputs)] * 2)
     assert client.supports_evaluate()
     assert not client.supports_gradient()
     assert not client.supports_apply_hessian()
@@ -117,7 +118,7 @@ def test_ctrl_c_ends_the_command(small_run: vibench.Run, main: Main, monkeypatch
     monkeypatch.setattr(ModelServer, "serve", serve)
     code, out, err = main("serve", str(small_run.path.parent), cell_of(small_run, "reduced"), "--port", "0")
     assert (code, err) == (130, "vibench: interrupted\n")
-    assert "(contact force, contact area, deflection), no bounds: `umbridge.HTTPModel('http://127.0.0.1:" in out
+    assert "lower deflection), no bounds: `umbridge.HTTPModel('http://127.0.0.1:" in out
 
 
 def is_running(process: Path) -> bool:
@@ -141,8 +142,10 @@ def test_a_server_ends_with_its_parent(command: str, small_run: vibench.Run, tmp
         assert not is_running(server)
 
 
-def test_what_cannot_be_served_is_refused(small_run: vibench.Run, main: Main) -> None:
+def test_what_cannot_be_served_is_refused(small_run: vibench.Run, main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
     run, obstacle = str(small_run.path.parent), cell_of(small_run, "reduced")
-    refused(main("serve", run, cell_of(small_run, "reduced", "radial-obstacle")), "the problem has no outputs")
+    with monkeypatch.context() as patch:
+        patch.setattr(Obstacle, "outputs", ())
+        refused(main("serve", run, obstacle), "the problem has no outputs")
     refused(main("serve", run, obstacle, "--host", "256.0.0.1"), "no server can listen at '256.0.0.1', port 4242")
     refused(main("serve", run, obstacle, "--port", "65536"), "--port")
