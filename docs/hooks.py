@@ -16,7 +16,7 @@ from sentences import rendered
 RESULTS = "results"
 """Folder of the repository, and of the site, with the pages of results."""
 
-SHOWN = {".md", ".png", ".csv"}
+SHOWN = {".md", ".png", ".csv", ".npz"}
 ELSEWHERE = re.compile(
     r"""<(?:script|img|iframe|link\s[^>]*rel=["']?stylesheet)[^>]*(?:src|href)=["']?(?:https?:)?//"""
 )
