@@ -10,12 +10,12 @@ One BLAS thread: OMP_NUM_THREADS=1.
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from time import process_time
 
 import numpy as np
 import pandas as pd
+from page import Page, made_by, start
 
 import vibench
 from vibench.calibration.data import Data, Prior, synthetic
@@ -26,6 +26,11 @@ STEPS, BURN_IN, SEED, NOISES = 5000, 1000, 2022, (0.03, 0.01, 0.003)
 PROBLEMS = {"obstacle": (1.05, 0.01, -0.02), "hertz": (1.03,)}
 TABLE = "chains.csv"
 TOLERANCES = {"obstacle": (3e-5, 3e-4), "hertz": (1e-4, 1e-3)}
+ABOUT = f"""Metropolis chains of {STEPS} steps, the first {BURN_IN} of which adapt, on problems at the paper's size. The
+data are synthetic, at (1.05, 0.01, −0.02) of the obstacle and at the radius 1.03 of Hertz. Tolerances of POD and cone
+are 3e-5 and 3e-4 for the obstacle, whose bounds interpolation limits, 1e-4 and 1e-3 for Hertz. Seconds are CPU seconds
+on a machine with other load, those of the high-fidelity chain at the mean of the questions. Proposals outside the box
+are no decisions."""
 
 
 def data_of(problem: vibench.Problem, truth: tuple[float, ...], noise: float) -> Data:
@@ -47,7 +52,7 @@ def reference(file: Path, problem: vibench.Problem, data: Data) -> tuple[np.ndar
     if not file.exists():
         decisions = Decisions(problem, data, None, 0.0, 0)
         chain, seconds = chain_of(decisions, problem)
-        about = json.dumps({"command": "python results/scripts/calibration.py results/calibration"})
+        about = json.dumps({"command": made_by("calibration", "calibration")})
         counts = {"seconds": seconds, "solutions": len(decisions.answers)}
         np.savez_compressed(file, states=chain.states, about=about, **counts)
     with np.load(file) as found:
@@ -71,7 +76,7 @@ def compare(folder: Path) -> None:
         for noise in NOISES:
             data = data_of(problem, truth, noise)
             states, seconds, solutions = reference(folder / f"{name}-{100 * noise:g}.npz", problem, data)
-            if "--reference" in sys.argv or (name, 100 * noise) in known(folder):
+            if (name, 100 * noise) in known(folder):
                 continue
             if model is None:
                 model, training = model_of(problem, TOLERANCES[name])
@@ -109,29 +114,20 @@ def known(folder: Path) -> set[tuple[str, float]]:
 
 def write_page(folder: Path, table: pd.DataFrame) -> None:
     """The page with the table, its columns as rows."""
-    shown = table.map(lambda value: f"{value:.3g}" if isinstance(value, float) else str(value)).T
-    files = sorted(file.name for file in folder.glob("*.npz"))
-    lines = [
-        "# Calibration: chains compared state by state", "",
-        "    python results/scripts/calibration.py results/calibration", "",
-        f"Metropolis chains of {STEPS} steps, the first {BURN_IN} of which adapt, on problems at the paper's size.",
-        "The data are synthetic, at (1.05, 0.01, −0.02) of the obstacle and at the radius 1.03 of Hertz. Tolerances of",
-        "POD and cone are 3e-5 and 3e-4 for the obstacle, whose bounds interpolation limits, 1e-4 and 1e-3 for Hertz.",
-        "",
-        "The states of the chains whose decisions the high-fidelity model takes are in",
-        f"{', '.join(f'[{name}]({name})' for name in files)}. [The table](chains.csv) has a column for each row below.",
-        "Seconds are CPU seconds on a machine with other load, those of the high-fidelity chain at the mean of the",
-        "questions. Proposals outside the box are no decisions.", "",
-        shown.iloc[1:].to_markdown(headers=["problem", *shown.iloc[0]]), "",
-    ]  # fmt: skip
-    (folder / "README.md").write_text("\n".join(lines), encoding="utf-8")
+    heads = [f"{problem}, {noise:g} %" for problem, noise in zip(table["problem"], table["noise [%]"], strict=True)]
+    shown = table.drop(columns=["problem", "noise [%]"]).T.set_axis(heads, axis=1)
+    chains = ", ".join(f"[{file.name}]({file.name})" for file in sorted(folder.glob("*.npz")))
+    page = Page(folder, "Calibration: chains compared state by state", made_by("calibration", "calibration"), ABOUT)
+    page.add(f"The states of the chains whose decisions the high-fidelity model takes are in {chains}.")
+    page.add(shown.rename_axis("problem, noise").reset_index(), f"As a table: [{TABLE}]({TABLE}).")
+    page.write()
 
 
-def main(folder: str) -> None:
-    target = Path(folder)
-    target.mkdir(parents=True, exist_ok=True)
-    compare(target)
+def main(target: str) -> None:
+    folder = Path(target)
+    folder.mkdir(parents=True, exist_ok=True)
+    compare(folder)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    start(main)

@@ -67,6 +67,16 @@ def scripts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(SCRIPTS))
 
 
+@pytest.mark.usefixtures("scripts")
+def test_one_command_makes_every_page_that_the_overview_lists() -> None:
+    everything = importlib.import_module("everything")
+    listed = everything.LINK.findall((RESULTS / "README.md").read_text(encoding="utf-8"))
+    folders = {Path(page).parent.name for page in listed}
+    assert len(folders) > 15
+    said = "\n".join(everything.commands())
+    assert [folder for folder in folders if f"results/{folder}" not in said] == []
+
+
 def rows_of(study: str, **equal: str) -> Iterator[dict[str, str]]:
     """Cells of a committed study, with these texts in these columns."""
     with (RESULTS / study / "cells.csv").open(encoding="utf-8", newline="") as file:

@@ -116,6 +116,15 @@ class Prior:
         return -0.5 * float(np.sum(((mu - self.mean) / self.sd) ** 2))
 
 
+def outputs_of(problem: Problem, names: Sequence[str]) -> tuple[Output, ...]:
+    """The outputs of a problem by their names; a `RequestError` if there is no such output."""
+    known = {output.name: output for output in problem.outputs}
+    for name in names:
+        if name not in known:
+            raise unknown_name("output of the problem", name, known)
+    return tuple(known[name] for name in names)
+
+
 def read_data(path: Path, problem: Problem) -> tuple[Data, Prior]:
     """The data and the prior of a TOML file; a `RequestError` names the file, the key and what would be right."""
     with placed(str(path)):
@@ -124,13 +133,10 @@ def read_data(path: Path, problem: Problem) -> tuple[Data, Prior]:
             file = _File.model_validate(content)
         except ValidationError as fault:
             raise RequestError(fault_line(fault, _File)) from None
-        known, values = {output.name: output for output in problem.outputs}, []
-        for name, sensor in file.sensors.items():
-            if name not in known:
-                raise unknown_name("output of the problem", name, known)
-            if sensor.unit not in (None, known[name].unit):
-                raise RequestError(f"sensors.{name}.unit is '{sensor.unit}', the output has '{known[name].unit}'")
-            values.append(sensor.value)
+        values = [sensor.value for sensor in file.sensors.values()]
+        for output, sensor in zip(outputs_of(problem, [*file.sensors]), file.sensors.values(), strict=True):
+            if sensor.unit not in (None, output.unit):
+                raise RequestError(f"sensors.{output.name}.unit is '{sensor.unit}', the output has '{output.unit}'")
         prior = Prior.of(problem.parameters, {name: (one.mean, one.sd) for name, one in file.prior.items()})
         if file.covariance is None:
             noise = np.array([_deviation(name, sensor) for name, sensor in file.sensors.items()])

@@ -41,8 +41,8 @@ import scipy.sparse as sp
 from cachetools import LRUCache
 
 from vibench.arrays import Array, SparseMatrix, is_sound
-from vibench.calibration.data import Data
-from vibench.errors import NumericalError, RequestError, unknown_name
+from vibench.calibration.data import Data, outputs_of
+from vibench.errors import NumericalError, RequestError
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.formulations import FormulationAnswer
 from vibench.interfaces.parameters import outside
@@ -90,11 +90,7 @@ class Sensors:
     accuracy = 1e-12
 
     def __init__(self, problem: Problem, names: tuple[str, ...]) -> None:
-        known = {output.name: output for output in problem.outputs}
-        for name in names:
-            if name not in known:
-                raise unknown_name("output of the problem", name, known)
-        self.problem, self.outputs = problem, tuple(known[name] for name in names)
+        self.problem, self.outputs = problem, outputs_of(problem, names)
 
     def high_fidelity(self) -> Callable[[Array], Array]:
         """From mu (d,) to the outputs (k,) of the high-fidelity solution; a `NumericalError` if it is less accurate."""
@@ -117,7 +113,7 @@ class BoundedSensors:
     """
 
     def __init__(self, model: Model, names: tuple[str, ...]) -> None:
-        problem, outputs = model.problem, Sensors(model.problem, names).outputs
+        problem, outputs = model.problem, outputs_of(model.problem, names)
         if model.certificate is None:
             raise RequestError("the model has no error bounds: a calibration needs one with bounds = true")
         self.model, self.certificate, self.base = model, model.certificate, model.certificate.base

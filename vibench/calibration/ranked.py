@@ -29,13 +29,8 @@ def minimise(
         import cma  # noqa: PLC0415  an extra
     # Criteria that look at values are switched off: ranks are no values. A seed of 0 means the clock.
     ignored = dict.fromkeys(("tolfun", "tolfunhist"), 0.0) | dict.fromkeys(("tolflatfitness", "tolstagnation"), np.inf)
-    limits = {
-        "seed": seed + 1,
-        "bounds": [np.zeros(box.dim), np.ones(box.dim)],
-        "tolx": tolx,
-        "maxiter": iterations,
-        "verbose": -9,
-    }
+    unit_cube = [np.zeros(box.dim), np.ones(box.dim)]
+    limits = {"seed": seed + 1, "bounds": unit_cube, "tolx": tolx, "maxiter": iterations, "verbose": -9}
     strategy = cma.CMAEvolutionStrategy(np.full(box.dim, 0.5), 0.2, limits | ignored)
 
     def compare(one: tuple[int, Array], other: tuple[int, Array]) -> int:

@@ -43,8 +43,8 @@ def calibrate(
     Error bounds take the decisions of a Metropolis chain where they suffice. Elsewhere the high-fidelity model is
     asked. Ctrl-C keeps its answers, and the same command continues with them.
     """
-    from vibench.calibration.data import read_data, refuse_unreachable, share
-    from vibench.calibration.decisions import BoundedSensors, Decisions, Sensors
+    from vibench.calibration.data import outputs_of, read_data, refuse_unreachable, share
+    from vibench.calibration.decisions import BoundedSensors, Decisions
     from vibench.calibration.metropolis import Metropolis, arviz
     from vibench.execution.recorded_cell import cell_model, recorded_cell
     from vibench.stages.base import build_problem
@@ -64,7 +64,7 @@ def calibrate(
         model, training = timed(lambda: cell_model(chosen) if recorded is None else recorded.model)
     with placed(str(data)):
         predict, solved = BoundedSensors(model, measured.sensors), model.offline.snapshots
-        sensors = Sensors(target, measured.sensors).outputs
+        sensors = outputs_of(target, measured.sensors)
         refuse_unreachable(measured, [one.values(solved.mu, solved.u, solved.lam) for one in sensors])
     decisions = Decisions(target, measured, predict, share(audit), seed)
     chain, folder = Metropolis(decisions, prior, steps // 5, seed), out or Path("calibrations") / data.stem
