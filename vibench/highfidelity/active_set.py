@@ -13,6 +13,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import NumericalError, at_parameter
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness, condensed_stiffness
+from vibench.interfaces.dual_sets import BlockKind, DualSet, refuse_blocks
 from vibench.interfaces.problem import NestedStart, Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly, in_float64, settled
 from vibench.linalg import EPS
@@ -95,6 +96,7 @@ class HighFidelitySolver:
 
         Raises a `NumericalError` that names mu, and what A lacks if that is the cause.
         """
+        refuse_blocks(vi.K, [BlockKind.INTERVAL], "the active set method")
         with at_parameter(mu), _explained(vi, f"A at mu = {mu.tolist()}"):
             return solve_unverified(vi, self.condensed(vi), self._start(mu))
 
@@ -119,7 +121,7 @@ class HighFidelitySolver:
     def remember(self, mu: Array, solution: ActiveSetSolution) -> None:
         """Let later solutions start from the contact set of this one, at mu (d,)."""
         self._solved.append(mu)
-        self._active.append(solution.lam > 0.0)
+        self._active.append(self._problem.K.free(solution.lam))
 
     def forget(self) -> None:
         """Forget all solutions, so that no later one starts from them; factorisations stay."""
@@ -138,7 +140,7 @@ class HighFidelitySolver:
                 self._coarse = HighFidelitySolver(start.coarse)
             # Remember nothing there: the start must depend on the parameter alone.
             coarse = self._coarse.solve_assembled(mu, checked_assembly(start.coarse, mu))
-            return np.asarray((coarse.lam > 0.0)[start.nearest])
+            return start.coarse.K.free(coarse.lam)[start.nearest]
         if start is not None and (np.shape(start) != (m,) or np.asarray(start).dtype != bool):
             got = f"the shape {np.shape(start)} and the type {np.asarray(start).dtype}"
             raise NumericalError(f"start returns an array of {got}; expected ({m},) and bool, a NestedStart, or None")
@@ -158,7 +160,8 @@ class HighFidelitySolver:
         if self._pattern is None:
             self._pattern, self._stiffness = self._elimination(vi), None
         if self._stiffness is None or "A" not in self._problem.constant:
-            self._stiffness = condensed_stiffness(vi.A, self._pattern, self._problem.factorisation, self._stiffness)
+            before, factorisation = self._stiffness, self._problem.factorisation
+            self._stiffness = condensed_stiffness(vi.A, self._pattern, factorisation, before, vi.K)
         return self._stiffness
 
     def _elimination(self, vi: VariationalInequality) -> EliminationPattern:
@@ -185,6 +188,7 @@ def solve_high_fidelity(
     fallback reaches `ACCURACY`.
     """
     vi = settled(in_float64(vi))
+    refuse_blocks(vi.K, [BlockKind.INTERVAL], "the active set method")
     check_symmetric(vi.A, "A")
     with _explained(vi, "A"):
         stiffness = stiffness or CondensedStiffness(vi.A)
@@ -211,7 +215,7 @@ def solve_unverified(
     Raises a `NumericalError` if neither the active set method nor its fallback finds a solution.
     """
     # Opposite rows whose bounds differ by round-off are an equality.
-    reading = rows_that_matter(vi.B, vi.g, 1e-14 * np.abs(vi.g))
+    reading = rows_that_matter(vi.B, vi.g, 1e-14 * np.abs(vi.g), K=vi.K)
     program = reading.program(vi)
     system = stiffness.active_set_system(program)
     starts = [] if start is None else [start[reading.kept]]
@@ -243,7 +247,7 @@ def verified(
     if not solution.residuals.worst <= ACCURACY:
         # Condensation may lose more digits than refinement wins back.
         plain = CondensedStiffness(vi.A)
-        again = solve_unverified(vi, plain, solution.lam > 0.0)
+        again = solve_unverified(vi, plain, vi.K.free(solution.lam))
         fallback = "; ".join(filter(None, (unverified.fallback, "solved without condensation")))
         solution = _refined_to_accuracy(vi, plain, replace(again, fallback=fallback))
     if not solution.residuals.worst <= ACCURACY:
@@ -268,7 +272,7 @@ def _refined_to_accuracy(
 
 def _refuse_contradictions(vi: VariationalInequality, numbers: Indices) -> None:
     """Raise a `NumericalError` with the `numbers` of two opposite rows of B that no u satisfies together."""
-    found = Directions.of(sp.csr_array(vi.B), np.ones(len(vi.g), bool))
+    found = Directions.of(sp.csr_array(vi.B), vi.K.rays(len(vi.g)))
     bounds = vi.g[found.members] / found.lengths[found.members]
     gaps = np.where(np.bincount(found.group, found.side) == 0.0, np.bincount(found.group, bounds), 0.0)
     if len(gaps) and gaps.min() < -1e-6 * np.abs(bounds).max():
@@ -278,6 +282,10 @@ def _refuse_contradictions(vi: VariationalInequality, numbers: Indices) -> None:
 
 def _without_cycling(vi: VariationalInequality, equal: Mask, system: ActiveSetSystem) -> tuple[Iterated, str]:
     """The solution where active sets cycle, or are linearly dependent, and the name of the fallback."""
+    if vi.K.blocks:
+        if (settled := _solution_everywhere(system, np.zeros(len(vi.g), bool), equal, one_by_one=True)) is None:
+            raise NumericalError("no active set solves the high-fidelity problem; is it feasible?")
+        return settled, "the active set cycled; its rows were changed one by one"
     answer, guess = solve_qp(vi, "piqp", ACCURACY), np.zeros(len(vi.g), bool)
     if not equal.any() and answer.alpha is not None and np.all(np.isfinite(answer.alpha)):
         weights = answer.alpha * row_norms(vi.B)
@@ -299,17 +307,19 @@ def _is_inaccurate(vi: VariationalInequality, u: Array, lam: Array) -> bool:
 def _refined(vi: VariationalInequality, stiffness: CondensedStiffness, u: Array, lam: Array) -> tuple[Array, Array]:
     """One step of iterative refinement on the active set, with residuals in extended precision."""
     residual, excess = verification.accurate_residuals(vi, u, lam)
-    active = np.flatnonzero(lam > 0.0)
-    system = stiffness.active_set_system(VariationalInequality(vi.A, residual, vi.B, -excess))
+    active = np.flatnonzero(vi.K.free(lam))
+    system = stiffness.active_set_system(replace(vi, f=residual, g=-excess))
     try:
         change, forces = system.holding(active)
     except (RuntimeError, np.linalg.LinAlgError):
         # The constraints are dependent, and nothing better is known.
         return u, lam
-    return u + change, np.maximum(lam + forces, 0.0)
+    return u + change, vi.K.project(lam + forces)
 
 
-def _solution_everywhere(system: ActiveSetSystem, active: Mask, equal: Mask | None = None) -> Iterated | None:
+def _solution_everywhere(
+    system: ActiveSetSystem, active: Mask, equal: Mask | None = None, *, one_by_one: bool = False
+) -> Iterated | None:
     """The u (n,), λ (m,) and iterations of the active set method; `None` where it finds no solution.
 
     Rows beyond the zone of the system are checked when those in it are settled, and enlarge it where they are violated.
@@ -317,7 +327,7 @@ def _solution_everywhere(system: ActiveSetSystem, active: Mask, equal: Mask | No
     iterations = 0
     while True:
         system = system.watching(active if equal is None else active | equal)
-        if (settled := active_set_iterations(system, active, equal)) is None:
+        if (settled := active_set_iterations(system, active, equal, one_by_one=one_by_one)) is None:
             return None
         u, lam, iterations = system.recover(settled[0]), settled[1], iterations + settled[2]
         if system.beyond is None:
@@ -326,7 +336,7 @@ def _solution_everywhere(system: ActiveSetSystem, active: Mask, equal: Mask | No
         violated = ~system.beyond.watched & (B @ u - g > _unit(B) * (abs(B) @ np.abs(u) + np.abs(g)))
         if not violated.any():
             return u, lam, iterations
-        active = (lam > 0.0) | violated
+        active = (lam > 0.0) | violated  # only contact has a zone
 
 
 def _unit(B: SparseMatrix) -> Array:
@@ -335,34 +345,72 @@ def _unit(B: SparseMatrix) -> Array:
     return np.asarray(4.0 * EPS * (np.diff(B.indptr) + 2.0))
 
 
-def active_set_iterations(system: ActiveSetSystem, active: Mask, equal: Mask | None = None) -> Iterated | None:
+def active_set_iterations(
+    system: ActiveSetSystem, active: Mask, equal: Mask | None = None, *, one_by_one: bool = False
+) -> Iterated | None:
     """Run the primal–dual active set method from an initial active set (m,): u (c,), λ (m,) and iterations.
 
     Constraints that are `equal` (m,) stay active, whatever the sign of their multiplier. The result is `None` if the
     sets cycle or one of them has linearly dependent constraints. Signs are decided row by row, against the round-off of
     the row itself, and multipliers are compared as forces: no result depends on the scaling of a row, or on a far one.
+
+    A row with an interval has three states: it is active, or λ = ±c, on the side of B u − g. With `one_by_one` only the
+    last row that has to change does, which ends for independent rows (Murty 1974), however slowly.
     """
     seen: set[bytes] = set()
     always = np.zeros_like(active) if equal is None else equal
-    active = active | always
-    B, g, weights = system.B, system.g, row_norms(system.B)
-    sizes, unit = abs(B), _unit(B)
-    for iteration in range(1, max(100, len(active)) + 1):  # the contact set may move node by node
+    active, m = active | always, len(active)
+    B, g, weights, c = system.B, system.g, row_norms(system.B), system.K.radii(m)
+    sizes, unit, slips = abs(B), _unit(B), np.isfinite(c)
+    fixed = np.zeros(m) if slips.any() else None
+    for iteration in range(1, max(100, (10 if one_by_one else 1) * m) + 1):  # the contact set may move node by node
         try:
-            u, lam = system.solve_active(np.flatnonzero(active))
+            u, lam = system.solve_active(np.flatnonzero(active), fixed)
         except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
             return None
-        forces = weights * lam
-        violated = ~active & (B @ u - g > unit * (sizes @ np.abs(u) + np.abs(g)))
+        forces, excess = weights * lam, B @ u - g
+        off = unit * (sizes @ np.abs(u) + np.abs(g))
+        violated = ~active & (excess > off)
         if system.beyond is not None:
             violated &= system.beyond.watched
         # A force that is round-off does not hold a row in contact.
         in_contact = active & (forces > 1e-14 * np.max(np.abs(forces), initial=0.0))
         following = violated | in_contact | always
-        if np.array_equal(following, active):
+        if fixed is not None:
+            following, held = _three_states(system.K, active, fixed, lam, excess, off, following)
+            changed = np.flatnonzero((following != active) | (held != fixed))
+            if one_by_one and len(changed):
+                following = np.where(np.arange(m) == changed[-1], following, active)
+                held = np.where(np.arange(m) == changed[-1], held, fixed)
+            key = following.tobytes() + held.tobytes()
+        else:
+            held, changed, key = None, np.flatnonzero(following != active), following.tobytes()
+        if not len(changed):
             return u, lam, iteration
-        if following.tobytes() in seen:
+        if key in seen:
             return None
-        seen.add(following.tobytes())
-        active = following
+        seen.add(key)
+        active, fixed = following, held
     return None
+
+
+def _three_states(
+    K: DualSet, active: Mask, fixed: Array, lam: Array, excess: Array, off: Array, rays: Mask
+) -> tuple[Mask, Array]:
+    """The next active rows (m,), those of rays being known, and the multipliers (m,) of rows that slip.
+
+    `excess` is B u − g and `off` (m,) the round-off in it.
+    """
+    c, following, held = K.radii(len(lam)), rays.copy(), np.zeros_like(fixed)
+    slips = np.isfinite(c)
+    # λ = ±c up to round-off is both states: the present one stays.
+    beyond = slips & active & (np.abs(lam) > c * (1.0 + 1e-12))
+    held[beyond] = np.copysign(c, lam)[beyond]
+    moving = slips & ~active & (np.abs(excess) > off)
+    # A row that moves against its force sticks; one without a force gets it.
+    right = moving & ((fixed == 0.0) | (fixed * excess > 0.0))
+    held[right] = np.copysign(c, excess)[right]
+    still = slips & ~active & ~moving & (fixed != 0.0)
+    held[still] = fixed[still]
+    following[slips] = ~(beyond | right | still)[slips]
+    return following, held

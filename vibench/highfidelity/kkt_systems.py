@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Protocol
 
 import numpy as np
 import scipy.linalg
@@ -20,6 +21,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee, structural_rank
 from scipy.sparse.linalg import splu
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix, times_dense
+from vibench.interfaces.dual_sets import RAYS, DualSet
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
@@ -78,8 +80,11 @@ def coarse_contact(solve: Callable[[Array], Array], vi: VariationalInequality) -
     return np.asarray(forces[group] > 0.0)
 
 
-# From the active constraints to u (c,) and λ (m,): these are equalities, all other multipliers vanish.
-ActiveSolver = Callable[[Indices], tuple[Array, Array]]
+class ActiveSolver(Protocol):
+    """Solves with some constraints as equalities."""
+
+    def __call__(self, active: Indices, fixed: Array | None = None) -> tuple[Array, Array]:
+        """The u (c,) and λ (m,) with the active constraints as equalities; other multipliers are `fixed`, or vanish."""
 
 
 class CondensedStiffness(Inverse):
@@ -235,7 +240,7 @@ class CondensedStiffness(Inverse):
             solve_active = SaddlePointSolver(self._A if whole else condensed.schur, load, B, vi.g, 16, whole)
             self._saddle = solve_active if whole else None
         recover = partial(condensed.recover, particular=particular)
-        return ActiveSetSystem(B, vi.g, solve_active, recover, condensed.correct_eliminated)
+        return ActiveSetSystem(B, vi.g, solve_active, recover, condensed.correct_eliminated, K=vi.K)
 
 
 class ZoneStiffness(CondensedStiffness):
@@ -298,13 +303,15 @@ class ZoneStiffness(CondensedStiffness):
 
 
 def condensed_stiffness(
-    A: SparseMatrix, pattern: EliminationPattern, factorisation: str, before: CondensedStiffness | None = None
-) -> CondensedStiffness:
+    A: SparseMatrix, pattern: EliminationPattern, factorisation: str, before: CondensedStiffness | None = None,
+    K: DualSet = RAYS,
+) -> CondensedStiffness:  # fmt: skip
     """Condense A on the unknowns that constraints involve, or on the zone of them that contact reaches.
 
-    `before` is the stiffness of another parameter of the problem, whose zone is the first one of this.
+    `before` is the stiffness of another parameter of the problem, whose zone is the first one of this. Rows with an
+    interval act everywhere: they have no zone.
     """
-    if not pattern.is_dense or len(pattern.interface) <= MANY_UNKNOWNS:
+    if not pattern.is_dense or len(pattern.interface) <= MANY_UNKNOWNS or K.blocks:
         return CondensedStiffness(A, pattern, factorisation)
     return ZoneStiffness(A, pattern, factorisation, before.zone if isinstance(before, ZoneStiffness) else None)
 
@@ -333,6 +340,7 @@ class ActiveSetSystem:
     recover: Callable[[Array], Array]
     correct_eliminated: Callable[[Array], Array]
     beyond: Beyond | None = None
+    K: DualSet = RAYS
 
     def watching(self, rows: Mask) -> ActiveSetSystem:
         """Return this system, or one of a larger zone in which some rows (m,) are watched, too."""
@@ -377,17 +385,19 @@ class SaddlePointSolver:
         B = _in_units(np.ones(len(g)), B, self._displacement)
         self._force = 1.0 / row_norms(B)
         self._A, self._f = _in_units(self._displacement, A, self._displacement), self._displacement * f
+        self._load = self._f
         self._B, self._g = _in_units(self._force, B, np.ones(len(f))), self._force * g
         self._factorised_set, self._is_factorised = np.zeros(0, dtype=np.intp), np.zeros(len(g), bool)
         self._factorisation: _BorderedFactorisation | None = None
 
-    def __call__(self, active: Indices) -> tuple[Array, Array]:
-        """The solution u (c,), λ (m,) with the active constraints as equalities and no other multiplier.
+    def __call__(self, active: Indices, fixed: Array | None = None) -> tuple[Array, Array]:
+        """The solution u (c,), λ (m,) of an `ActiveSolver`.
 
         Raises a `RuntimeError` if the system is exactly singular, or is so whatever the entries of B are.
         """
         solution, is_active = None, np.zeros(len(self._g), bool)
         is_active[active] = True
+        self._load = self._f if fixed is None else self._f - self._B.T @ (fixed / self._force)
         if self._factorisation is not None and np.count_nonzero(is_active != self._is_factorised) <= self._border:
             solution = self._solve_bordered(self._factorisation, active, is_active)
         if solution is None:
@@ -402,7 +412,7 @@ class SaddlePointSolver:
             self._factorised_set, self._is_factorised = active, is_active
             solution = self._solve_bordered(self._factorisation, active, is_active)
         assert solution is not None  # an empty border is always independent
-        return solution
+        return solution if fixed is None else (solution[0], solution[1] + fixed)
 
     @property
     def is_definite(self) -> bool:
@@ -435,7 +445,8 @@ class SaddlePointSolver:
         border[n + removed, len(added) + np.arange(len(removed))] = 1.0
         values = np.concatenate([self._g[added], np.zeros(len(removed))])
         names = [*added.tolist(), *(-1 - removed).tolist()]
-        if (solved := factorisation.solve(names, border, np.concatenate([self._f, self._g[base]]), values)) is None:
+        right = np.concatenate([self._load, self._g[base]])
+        if (solved := factorisation.solve(names, border, right, values, self._load is not self._f)) is None:
             return None
         u, lam = np.empty(n), np.zeros(self._B.shape[0])
         u[self._order] = self._displacement * solved[0][:n]
@@ -482,13 +493,16 @@ class _BorderedFactorisation:
         corner = self._factor.L[:, n:].T @ solved
         return solved[:n], np.asarray(-self.pivots[n:] @ corner**2)
 
-    def solve(self, names: list[int], border: Array, right: Array, values: Array) -> tuple[Array, Array] | None:
+    def solve(
+        self, names: list[int], border: Array, right: Array, values: Array, is_new: bool
+    ) -> tuple[Array, Array] | None:
         """The x (k,) and y (d,) with K x + C y = r and Cᵀx = s; `None` where Cᵀ K⁻¹ C is not clearly regular.
 
-        `names` say which columns of C, and of borders before it, are the same; r is always the same.
+        `names` say which columns of C, and of borders before it, are the same; r is the same unless it `is_new`.
         """
-        if self._unbordered is None:
-            self._unbordered = self._factor.solve(right)
+        first = self._factor.solve(right) if is_new or self._unbordered is None else self._unbordered
+        if not is_new:
+            self._unbordered = first
         new = [k for k, name in enumerate(names) if name not in self._columns]
         if new:
             self._columns.update(zip([names[k] for k in new], self._factor.solve(border[:, new]).T, strict=True))
@@ -501,7 +515,7 @@ class _BorderedFactorisation:
             y = np.linalg.solve(schur, border.T @ unbordered - values)
             return unbordered - solved @ y, y
 
-        x, y = bordered(self._unbordered, values)
+        x, y = bordered(first, values)
         rest = right - self._matrix @ x - border @ y
         # The constraints contradict each other, or round-off alone made their system regular.
         if self.pivots is None and not peak(rest) <= 1e-3 * peak(right):
@@ -536,20 +550,24 @@ class ComplianceSolver:
         self._rows = np.arange(len(g)) if rows is None else np.flatnonzero(rows)
         self._contact: Array | None = None
 
-    def __call__(self, active: Indices) -> tuple[Array, Array]:
-        """The u (c,) and λ (m,); raises a `LinAlgError` where the rows are dependent."""
-        lam, rows = np.zeros(len(self._g)), self._B[active]
+    def __call__(self, active: Indices, fixed: Array | None = None) -> tuple[Array, Array]:
+        """The u (c,) and λ (m,) of an `ActiveSolver`; raises a `LinAlgError` where the rows are dependent."""
+        rows, unconstrained, excess = self._B[active], self._unconstrained, self._excess
+        lam = np.zeros(len(self._g)) if fixed is None else fixed.copy()
+        if fixed is not None:
+            unconstrained = unconstrained - self._compliance @ (self._B.T @ fixed)
+            excess = self._B @ unconstrained - self._g
         if not len(active):
-            return self._unconstrained, lam
+            return unconstrained, lam
         if len(active) > rows.shape[1]:
             raise np.linalg.LinAlgError("more constraints than unknowns are active")
-        contact, excess = self._contact_of(active), self._excess[active]
+        contact, excess = self._contact_of(active), excess[active]
         scale = 1.0 / np.sqrt(np.diag(contact))  # rows of any length
         factor = scipy.linalg.cho_factor(contact * np.outer(scale, scale), overwrite_a=True, check_finite=False)
         forces = scale * scipy.linalg.cho_solve(factor, scale * excess)
         forces += scale * scipy.linalg.cho_solve(factor, scale * (excess - contact @ forces))
         lam[active] = forces
-        return self._unconstrained - self._compliance @ (rows.T @ forces), lam
+        return unconstrained - self._compliance @ (rows.T @ forces), lam
 
     def _contact_of(self, active: Indices) -> Array:
         # Successive active sets share the matrix of all rows, which pays once a quarter of them are active.

@@ -41,12 +41,12 @@ def zero_rows(B: SparseMatrix | Array) -> Mask:
     return np.asarray(np.bincount(rows, B.data != 0.0, B.shape[0]) == 0.0)
 
 
-def settled_bounds(B: SparseMatrix, g: Array) -> Array:
-    """The bound g (m,), with 0 where it is below zero by round-off and the row of B (m×n) is zero.
+def settled_bounds(B: SparseMatrix, g: Array, rays: Mask | bool = True) -> Array:
+    """The bound g (m,), with 0 where it is below zero by round-off and the row of B (m×n), a ray, is zero.
 
     Raises a `NumericalError` that names a zero row whose bound is negative: no u satisfies 0 ≤ g there.
     """
-    negative = g < 0.0
+    negative = (g < 0.0) & rays
     if not negative.any() or not len(wrong := np.flatnonzero(zero_rows(B) & negative)):
         return g
     row = int(wrong[np.argmin(g[wrong])])

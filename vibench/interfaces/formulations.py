@@ -26,6 +26,7 @@ from typing import Annotated, Any, ClassVar, Protocol, TypeAlias
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
+from vibench.interfaces.dual_sets import BlockKind
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, PrimalStrategy, Stop
 from vibench.signatures import bordered
@@ -231,11 +232,11 @@ class FormulationModel(ABC):
 
     @abstractmethod
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
-        """The pair u (n,) and λ (m,) ≥ 0 of an answer at mu (d,); bases may depend on the parameter.
+        """The pair u (n,) and λ (m,) ∈ K of an answer at mu (d,); bases may depend on the parameter.
 
         It is part of the query where half of the coefficients do not give half of the pair. Of the answer `x` and
-        `alpha` alone are kept in results, and given here. λ is `None` for `Multiplier.RESIDUAL`, and for no other. A
-        negative coefficient of λ is an error, even one of round-off: every bound needs λ ≥ 0.
+        `alpha` alone are kept in results, and given here. λ is `None` for `Multiplier.RESIDUAL`, and for no other. A λ
+        outside of K, as one with a negative coefficient, is an error, even one of round-off: every bound needs λ ∈ K.
         """
 
     def program(self, mu: Array) -> Any:
@@ -272,6 +273,8 @@ class Formulation(ABC):
     """Whether its models have a `certificate`: cells may then ask for bounds."""
     assembled: ClassVar[str] = "full"
     """Assembly of the offline phase where "assembly" is none of its axes: "full" or "reduced"."""
+    blocks: ClassVar[tuple[BlockKind, ...]] = ()
+    """Kinds of blocks besides rays that the dual set K of a problem may have."""
     is_default: ClassVar[bool] = False
     """Whether studies that name no formulation have this one; of all that are registered at most one."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar
@@ -17,6 +17,7 @@ from vibench.arrays import Array, Indices, Mask, SparseMatrix, real_matrix, real
 from vibench.errors import at_parameter
 from vibench.interfaces.absent_rows import settled_bounds, without_infinities
 from vibench.interfaces.affine import AffineSum
+from vibench.interfaces.dual_sets import RAYS, DualSet
 from vibench.interfaces.outputs import MeshFields, Output, Picture
 from vibench.interfaces.parameters import ParameterBox
 from vibench.linalg.factorisations import DEFAULT
@@ -26,7 +27,7 @@ from vibench.signatures import Rule, bordered
 
 @dataclass(frozen=True)
 class VariationalInequality:
-    """u = argmin ½ uᵀA u − fᵀu subject to B u ≤ g at one parameter (paper, equations (1), (2) and (7)).
+    """u = argmin ½ uᵀA u − fᵀu + σ_K(B u − g) at one parameter, B u ≤ g for rays (paper, equations (1), (2) and (7)).
 
     Attributes
     ----------
@@ -35,12 +36,14 @@ class VariationalInequality:
     f
         Load (n,), including the contribution of the Dirichlet lift.
     B
-        Constraint, sparse (m×n), sign such that A u + Bᵀλ = f with λ ≥ 0.
+        Constraint, sparse (m×n), sign such that A u + Bᵀλ = f with λ ∈ K.
     g
         Bound (m,), including the contribution of the Dirichlet lift; +inf, read as `ABSENT`, where a row constrains
         nothing, and its multiplier is zero. A zero row of B with g ≥ 0 constrains nothing, either.
     dirichlet_lift
         Lifting of inhomogeneous Dirichlet data, added to u in pictures only; `None` for homogeneous data.
+    K
+        Set of the multipliers: λ ≥ 0, or with intervals a bound of |λ_i| in some rows.
     """
 
     A: Annotated[SparseMatrix, "n", "n"]
@@ -48,6 +51,7 @@ class VariationalInequality:
     B: Annotated[SparseMatrix, "m", "n"]
     g: Annotated[Array, "m"]
     dirichlet_lift: Array | None = None
+    K: DualSet = RAYS
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "g", without_infinities(self.g))
@@ -55,7 +59,12 @@ class VariationalInequality:
     def copy(self) -> VariationalInequality:
         """A copy in arrays of its own: a problem may write its next assembly into those of this one."""
         lift = None if self.dirichlet_lift is None else self.dirichlet_lift.copy()
-        return VariationalInequality(self.A.copy(), self.f.copy(), self.B.copy(), self.g.copy(), lift)
+        return VariationalInequality(self.A.copy(), self.f.copy(), self.B.copy(), self.g.copy(), lift, self.K)
+
+    def kept(self, rows: Indices) -> VariationalInequality:
+        """The same with some rows (k,) of the constraint alone."""
+        B = self.B[rows] if isinstance(self.B, np.ndarray) else sp.csr_array(self.B)[rows]
+        return replace(self, B=B, g=self.g[rows], K=self.K.of(rows, len(self.g)))
 
 
 @dataclass(frozen=True)
@@ -132,6 +141,8 @@ class Problem(ABC):
     """Inner product of the primal space, X_V (n×n), independent of the parameter."""
     W: Annotated[InnerProduct, "m"]
     """Inner product of the multiplier space, X_W (m×m), in a basis whose nonnegative coefficients are the cone W⁺."""
+    K: DualSet = RAYS
+    """The set of the multipliers, which every assembly has; it does not depend on mu."""
     constant: ClassVar[frozenset[str]] = frozenset()
     """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu."""
     affine: Mapping[str, AffineSum] = MappingProxyType({})

@@ -16,6 +16,7 @@ import numpy as np
 
 from vibench.arrays import Array, Mask, read_only, taken
 from vibench.errors import NumericalError, RequestError, placed
+from vibench.interfaces.dual_sets import BlockKind
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
@@ -70,12 +71,15 @@ class Cone:
         Which generators may be used with either sign (R,), none in an ordinary cone.
     fallbacks
         One line for every step that deviates from the algorithm.
+    gauges
+        γ (R,) of a hull, whose coefficients have Σ γ_i α_i ≤ 1; `None` for a cone.
     """
 
     generators: Annotated[Array, "m", "R"]
     errors: Annotated[Array, "k"]
     free: Annotated[Mask, "R"]
     fallbacks: tuple[str, ...] = ()
+    gauges: Annotated[Array, "R"] | None = None
 
     def __post_init__(self) -> None:
         for name in ("generators", "errors", "free"):
@@ -106,9 +110,12 @@ class Strategy:
 class DualStrategy(Strategy, ABC):
     """Builds a reduced cone from multiplier snapshots. Constructor arguments are the plugin's options."""
 
+    blocks: ClassVar[tuple[BlockKind, ...]] = ()
+    """Kinds of blocks besides rays that K may have."""
+
     @abstractmethod
     def reduce(self, snapshots: Annotated[Array, "m", "P"], W: Annotated[InnerProduct, "m"], stop: Stop) -> Cone:
-        """Cone for snapshots λ(mu_p) (m×P, coefficientwise nonnegative); `stop` bounds its projection error or size."""
+        """Cone for snapshots λ(mu_p) ∈ K (m×P, rays ≥ 0); `stop` bounds its projection error or size."""
 
 
 class Kind(StrEnum):

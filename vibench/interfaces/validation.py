@@ -16,13 +16,17 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, Mask, real_matrix, real_vector, taken
 from vibench.errors import NumericalError, RequestError, at_parameter
 from vibench.interfaces.absent_rows import ABSENT, is_absent, settled_bounds
+from vibench.interfaces.dual_sets import RAYS, DualSet
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, Sampling, check_sample
 from vibench.linalg.inner_product import InnerProduct
 
 
-def check_cone(cone: object, W: InnerProduct) -> Cone:
-    """A copy of a cone; refused if generators are not finite, of the right shape, unit norm in W, or in W⁺ or free."""
+def check_cone(cone: object, W: InnerProduct, K: DualSet = RAYS) -> Cone:
+    """A copy of a cone; refused if generators are not finite, of the right shape, of unit norm in W, or in W⁺ or free.
+
+    Rows of K that are no rays may have any sign.
+    """
     if not isinstance(cone, Cone):
         raise NumericalError(f"the dual strategy returned a {type(cone).__name__}, expected a Cone")
     chi = taken(cone.generators, "`generators` of the cone", W.dim, "count")
@@ -37,12 +41,15 @@ def check_cone(cone: object, W: InnerProduct) -> Cone:
         worst = f"generator {away.argmax()} has norm {norms[away.argmax()]:.6g}"
         raise NumericalError(f"the generators do not all have unit norm in W: {worst}")
     # Free generators may have any sign.
-    signed = np.where(cone.free, 0.0, chi)
+    signed = np.where(cone.free | ~K.rays(W.dim)[:, None], 0.0, chi)
     if signed.min(initial=0.0) < 0.0:
         i, r = np.unravel_index(signed.argmin(), signed.shape)
         worst = f"the negative coefficient {signed[i, r]:.1e} and is not declared free"
         raise NumericalError(f"a generator has {worst}: look at coefficient {i} of generator {r}")
-    return Cone(chi, errors, cone.free.copy(), tuple(map(str, cone.fallbacks)))
+    gauges = None if cone.gauges is None else taken(cone.gauges, "`gauges` of the cone", R)
+    if gauges is not None and (gauges.min(initial=1.0) <= 0.0 or cone.free.any()):
+        raise NumericalError("`gauges` of the cone are not positive, or it has free generators, which no hull has")
+    return Cone(chi, errors, cone.free.copy(), tuple(map(str, cone.fallbacks)), gauges)
 
 
 def check_enrichment(
@@ -90,12 +97,16 @@ def in_float64(vi: VariationalInequality) -> VariationalInequality:
     A, B, f, g = real_matrix(vi.A, "A"), real_matrix(vi.B, "B"), real_vector(vi.f, "f"), real_vector(vi.g, "g")
     if A is vi.A and B is vi.B and f is vi.f and g is vi.g:
         return vi
-    return VariationalInequality(A, f, B, g, vi.dirichlet_lift)
+    return VariationalInequality(A, f, B, g, vi.dirichlet_lift, vi.K)
 
 
 def settled(vi: VariationalInequality) -> VariationalInequality:
     """The same with `settled_bounds`, for which it raises a `NumericalError`."""
-    g = settled_bounds(vi.B, vi.g)
+    rays = vi.K.rays(len(vi.g))
+    g = settled_bounds(vi.B, vi.g, rays)
+    if (absent := is_absent(g) & ~rays).any():
+        row = int(np.flatnonzero(absent)[0])
+        raise NumericalError(f"g is infinite in row {row}, whose multiplier has a bound; leave that row out of K")
     return vi if g is vi.g else replace(vi, g=g)
 
 
@@ -126,6 +137,9 @@ def checked_assembly(problem: Problem, mu: Annotated[Array, "d"]) -> Variational
             remedy = f"choose units in which they are between {1.0 / largest:.0e} and {largest:.0e}"
             found = f"{name} has entries of up to {peak:.0e} at mu = {mu.tolist()}"
             raise NumericalError(f"{found}; products of such numbers over- or underflow: {remedy}")
+    if vi.K != problem.K:
+        found = f"the assembly at mu = {mu.tolist()} has {vi.K.names()} as K, or other rows or radii of these"
+        raise NumericalError(f"{found}; `problem.K` has {problem.K.names()}, and both have to be equal")
     with at_parameter(mu):
         return settled(vi)
 

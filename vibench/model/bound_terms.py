@@ -19,14 +19,17 @@ import numpy as np
 import scipy.linalg
 
 from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.interfaces.dual_sets import DualSet
 
 
 class BoundNote(StrEnum):
     """Reason why a bound is missing, estimated or not from prepared data, and which bound of β_A is used."""
 
     NOT_IN_CONE = "λ_N has negative coefficients"
+    NOT_IN_SET = "λ_N is outside the set K of the multipliers"
     ON_ABSENT_ROW = "λ_N is not zero on a row whose g is infinite"
     NO_CORRECTION = "no w with B w ≥ s was found"
+    UNCORRECTED = "the bound is that of w = 0: no better w was found"
     ESTIMATED = "α is estimated"
     ROUND_OFF = "no lower bound of A is known from which round-off in the norm of its inverse could be bounded"
     NOT_UNIQUE = "λ has no bound in W: no β_A > 0 is proved, as where rows are dependent or equalities"
@@ -38,6 +41,11 @@ class BoundNote(StrEnum):
     NO_BODY = "no beta_A: B is declared to be no multiple of one matrix, and constant on no body"
     NOT_PROVED = "no beta_A: no positive lower bound of the inf-sup constant of the constant part of B is proved"
     NOT_CONSTANT = "no beta_A: B is not at this parameter what it is at the training parameters on any body"
+
+
+def outside_note(K: DualSet) -> BoundNote:
+    """Why a λ_N outside of K has no bound."""
+    return BoundNote.NOT_IN_SET if K.blocks else BoundNote.NOT_IN_CONE
 
 
 class CorrectionMode(StrEnum):
@@ -52,27 +60,13 @@ class CorrectionMode(StrEnum):
         return self is CorrectionMode.FEASIBLE or (self is CorrectionMode.AUTO and omega > rho)
 
 
-def in_dual_set(lam: Array) -> bool:
-    """Tell whether λ (m,) is in the dual set K; today K has a ray for every row, λ ≥ 0."""
-    return not lam.min(initial=0.0) < 0.0
-
-
-def dual_gap(lam: Array, slack: Array) -> float:
-    """The term κ = σ_K(s − B w) − λᵀ(s − B w) of λ ∈ K from B w − s (m,).
-
-    The support function σ_K of rays is zero where B w ≥ s. All uses of K in the bounds are here and in `in_dual_set`.
-    """
-    # round-off may leave a negative product of numbers that vanish in pairs
-    return max(0.0, float(lam @ slack))
-
-
 # not frozen: an object of a frozen class takes four times as long to make, in every certified query
 @dataclass(slots=True)
 class BoundTerms:
     """Terms of the bounds (ii) of one pair u_N and λ_N with one correction w, or upper bounds of these terms.
 
-    ρ = ‖r‖_{A⁻¹}, ω = ‖w‖_A, κ (see `dual_gap`) and the `gap` ‖r + A w‖²_{A⁻¹} + 2κ, twice the duality gap of λ_N and
-    the feasible u_N − w.
+    ρ = ‖r‖_{A⁻¹}, ω = ‖w‖_A, κ (see `DualSet.gap`) and the `gap` ‖r + A w‖²_{A⁻¹} + 2κ, twice the duality gap of λ_N
+    and the feasible u_N − w.
     """
 
     rho: float

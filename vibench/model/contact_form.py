@@ -83,8 +83,8 @@ class ContactForm:
 
     @cached_property
     def directions(self) -> Directions:
-        """Lengths of the rows, and which of those that are not absent are parallel."""
-        return Directions.of(self.B, ~is_absent(self.vi.g))
+        """Lengths of the rows, and which rays that are not absent are parallel."""
+        return Directions.of(self.B, ~is_absent(self.vi.g) & self.vi.K.rays(len(self.vi.g)))
 
     @cached_property
     def near(self) -> Mask:
@@ -144,7 +144,7 @@ class ContactForm:
     @cached_property
     def _matter(self) -> Rows:
         room = round_off_of_terms(self.entries, np.abs(self.vi.g))
-        return rows_that_matter(self.B, self.vi.g, room, directions=self.directions)
+        return rows_that_matter(self.B, self.vi.g, room, directions=self.directions, K=self.vi.K)
 
     @property
     def tied(self) -> Mask:
@@ -210,16 +210,18 @@ class ContactForm:
         return Representer(self._stiffness.compliance(terms.load), terms.load, terms.rest).norm
 
     def correction_system(self, rows: Indices, pressed: Array, least: Array) -> ActiveSetSystem:
-        """The systems of min ½‖w‖²_A + ηᵀB w subject to B w ≥ s in some rows (k,), with η (m,) and s (k,)."""
-        vi = self.vi
+        """The systems of min ½‖w‖²_A + ηᵀB w + σ_K(s − B w) for some rows (k,), with η (m,) and s (k,)."""
+        vi, K = self.vi, self.vi.K.of(rows, len(self.vi.g))
         if not self.is_dense:
-            program = VariationalInequality(vi.A, -(vi.B.T @ pressed), -sp.csr_array(vi.B)[rows], -least)
+            program = VariationalInequality(vi.A, -(vi.B.T @ pressed), -sp.csr_array(vi.B)[rows], -least, K=K)
             return self._stiffness.active_set_system(program)
         B = -(self.B if len(rows) == len(vi.g) else self.B[rows])
 
-        def solve_active(active: Indices) -> tuple[Array, Array]:
+        def solve_active(active: Indices, fixed: Array | None = None) -> tuple[Array, Array]:
             # in terms of ν − η, which is small where η is nearly the multiplier: nothing cancels
-            chosen, forces, released = rows[active], np.zeros(len(rows)), pressed.copy()
+            forces = np.zeros(len(rows)) if fixed is None else fixed.copy()
+            chosen, released = rows[active], pressed.copy()
+            released[rows] -= forces
             released[chosen] = 0.0
             w = -self._displaced(released)
             if len(active):
@@ -228,7 +230,7 @@ class ContactForm:
                 w += added @ self.liftings[chosen]
             return w, forces
 
-        return ActiveSetSystem(B, -least, solve_active, self.extended, np.asarray)
+        return ActiveSetSystem(B, -least, solve_active, self.extended, np.asarray, K=K)
 
     def holding(self, rows: Indices, values: Array) -> Representer:
         """The representer of the force Bᵀξ of some rows (k,) with B A⁻¹Bᵀξ = B v there, v (c,) on retained unknowns.

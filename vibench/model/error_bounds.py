@@ -35,7 +35,7 @@ from vibench.interfaces.absent_rows import is_absent
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg import EPS, UNIT_ROUND_OFF
 from vibench.linalg.inner_product import InnerProduct
-from vibench.model.bound_terms import BoundNote, BoundTerms, Equalities, dual_gap, first_margin, in_dual_set
+from vibench.model.bound_terms import BoundNote, BoundTerms, Equalities, first_margin, outside_note
 from vibench.model.contact_form import ContactForm, Representer
 from vibench.model.errors import EnergyNorm, solutions, with_one_stiffness
 from vibench.model.proved_norms import ProvedNorms
@@ -101,8 +101,8 @@ def error_bounds(
     found, pairs = [ErrorBounds.none(BoundNote.NO_CORRECTION)] * len(vis), dict[int, _Pair]()
     share, solved = share_of_diagonal(V), solutions(energies, residuals)
     for k, (vi, energy, (alpha, _), start) in enumerate(zip(vis, energies, constants, starts, strict=True)):
-        if not in_dual_set(lam[k]):
-            found[k] = ErrorBounds.none(BoundNote.NOT_IN_CONE)
+        if not vi.K.contains(lam[k]):
+            found[k] = ErrorBounds.none(outside_note(vi.K))
         elif np.any(lam[k][is_absent(vi.g)]):
             found[k] = ErrorBounds.none(BoundNote.ON_ABSENT_ROW)
         elif not alpha.value * share.value > 0.0:
@@ -146,6 +146,7 @@ class _ProvedTerms:
     rest: Array
     missed: float
     share: float
+    note: str
 
     @property
     def accurate(self) -> bool:
@@ -157,7 +158,8 @@ class _ProvedTerms:
         of_u, of_lam, estimated = self.of_u, self.of_lam, not (alpha.proved and proved)
         in_V = of_u.primal / float(np.sqrt(alpha.value))
         in_W = of_lam.dual / beta.value if beta.value > 0.0 else inf
-        notes = [BoundNote.ESTIMATED] * estimated + [BoundNote.NOT_UNIQUE] * (not beta.value > 0.0)
+        found = [BoundNote.ESTIMATED] * estimated + [BoundNote.NOT_UNIQUE] * (not beta.value > 0.0)
+        notes = [*found, self.note] if self.note else found
         terms = of_u.rho, of_lam.rho, of_u.omega, of_u.kappa
         return ErrorBounds(of_u.primal, in_V, of_lam.dual, in_W, *terms, "; ".join(notes))
 
@@ -212,7 +214,7 @@ def _terms_of(pairs: Sequence[_Pair], norms: ProvedNorms, floor: Array) -> Itera
             share = max(share, float(lost))
         correction, terms = pair.correction, (rho + beyond, omega, float(feasible) + beyond)
         of_u = _with_round_off(correction, start, np.abs(start), pair.lam, correction.eta, terms)
-        yield _ProvedTerms(of_u, of_u if of_lam is None else of_lam, rest[:, k], beyond, share)
+        yield _ProvedTerms(of_u, of_u if of_lam is None else of_lam, rest[:, k], beyond, share, correction.note)
 
 
 def _moved_terms(
@@ -252,7 +254,7 @@ def _with_round_off(
     `size` (c,) bounds the terms of u.
     """
     contact, w, equalities = correction.contact, correction.values, correction.constraints.equalities
-    kappa = dual_gap(lam, _slack(contact, u, w) + _round_off(contact, size, w)) * (1.0 + (len(lam) + 16.0) * EPS)
+    kappa = contact.vi.K.gap(lam, _slack(contact, u, w), _round_off(contact, size, w)) * (1.0 + (len(lam) + 16.0) * EPS)
     if equalities is not None:
         kappa += eta * float(lam @ equalities.reach)
     rho, omega, feasible = norms
@@ -273,7 +275,7 @@ def reference_bound(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam
         size = hypot(energy.norm(u), contact.force_norm(lam))
     round_off = np.nan_to_num(_round_off(contact, np.abs(contact.values(u)), correction.values), posinf=0.0)
     # 2κ is at most twice λᵀ times the first margin and the round-off itself, where w was found at once
-    open_by_round_off = np.sqrt(4.0 * float(lam @ first_margin(round_off)))
+    open_by_round_off = np.sqrt(4.0 * vi.K.gap(lam, np.zeros_like(lam), first_margin(round_off)))
     if not bound <= max(REFERENCE * size, open_by_round_off):
         what = f"the error bound of the high-fidelity solution is {ratio(bound, size):.1e} of it in the energy norm"
         raise NumericalError(f"{what}, above {REFERENCE:.0e}")
@@ -299,7 +301,7 @@ def corrected_pair(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam:
     if (correction := find_correction(vi, energy, u, lam)) is None:
         return None
     terms = bound_terms(correction, u, lam)
-    return CorrectedPair(u - correction.w, np.maximum(correction.nu, 0.0), terms.omega, terms.rho)
+    return CorrectedPair(u - correction.w, vi.K.project(correction.nu), terms.omega, terms.rho)
 
 
 @dataclass(frozen=True)
@@ -316,7 +318,7 @@ class Constraints:
         vi = contact.vi
         # opposite rows with less room than 1e-12 of the terms of s are an equality: no margin would fit between them
         room = 1e-12 * (contact.sizes @ np.abs(u) + np.abs(vi.g))
-        rows, equalities = rows_that_matter(contact.B, vi.g, room, lam, contact.directions), None
+        rows, equalities = rows_that_matter(contact.B, vi.g, room, lam, contact.directions, vi.K), None
         if rows.equal.any():
             K = energy.factor.solve_factor_transposed(sp.csr_array(vi.B)[rows.equalities].toarray().T)
             equalities = Equalities.from_rows(K, lambda y: contact.values(energy.factor.solve_factor(y)), contact.B)
@@ -375,6 +377,7 @@ class Correction:
     nu: Array
     eta: float
     constraints: Constraints
+    note: str = ""
 
     @property
     def contact(self) -> ContactForm:
@@ -394,7 +397,7 @@ def bound_terms(correction: Correction, u: Array, lam: Array) -> BoundTerms:
     """
     contact, eta, equalities = correction.contact, correction.eta, correction.constraints.equalities
     riesz = contact.representer(residual(contact.vi, u, lam))
-    kappa = dual_gap(lam, _slack(contact, contact.values(u), correction.values))
+    kappa = contact.vi.K.gap(lam, _slack(contact, contact.values(u), correction.values))
     if equalities is not None:
         kappa += eta * float(lam @ equalities.reach)
     omega = Representer(correction.values, correction.load, 0.0).norm + eta
@@ -413,14 +416,16 @@ def find_correction(
     u = contact.values(u)
     constraints = Constraints.classify(energy, contact, u, lam)
     kept, equal = constraints.rows.kept, constraints.rows.equal
-    excess = (contact.B @ u - vi.g)[kept]
-    margin = np.where(equal, 0.0, first_margin(_round_off(contact, np.abs(u), np.zeros_like(u)))[kept])
+    excess, rays = (contact.B @ u - vi.g)[kept], vi.K.rays(len(vi.g))[kept]
+    # Only rays have something to satisfy, and so a margin, which no equality has.
+    strict = rays & ~equal
+    margin = np.where(strict, first_margin(_round_off(contact, np.abs(u), np.zeros_like(u)))[kept], 0.0)
     # the largest multiplier s / b A⁻¹bᵀ that a row b w ≥ s would have alone, from above
-    alone = float(np.max(excess * contact.stiffnesses[kept], initial=0.0))
+    alone = float(np.max(excess * contact.stiffnesses[kept], initial=0.0, where=rays))
     lengths = np.sqrt(contact.stiffnesses[kept])
     # multipliers 10⁸ times larger are those of dependent constraints, solved in round-off
     largest = 1e8 * max(np.max(lam, initial=0.0), alone)
-    starts, doubtful = [chosen[kept] for chosen in (pressed, lam > 0.0) if chosen is not None], None
+    starts, doubtful = [chosen[kept] for chosen in (pressed, vi.K.free(lam)) if chosen is not None], None
     for _ in range(4):
         for values, forces in _minimisers(constraints, energy, lam, excess + margin, starts, largest):
             multipliers = np.zeros(len(vi.g))
@@ -430,15 +435,18 @@ def find_correction(
             if not np.all(lacking <= 0.0):  # NaN is not
                 # w is solved for as a whole: what one row lacks by its round-off others may lack in the next attempt
                 missed = np.nan_to_num(lacking[kept], nan=0.0, posinf=0.0) * lengths
-                margin = np.maximum(margin, np.where(equal, 0.0, 2.0 * np.max(missed, initial=0.0) / lengths))
+                margin = np.maximum(margin, np.where(strict, 2.0 * np.max(missed, initial=0.0) / lengths, 0.0))
                 continue
             nu, load = constraints.rows.multipliers(forces, len(vi.g)), contact.load(w, multipliers - lam)
             correction = Correction(w, load, nu, eta, constraints)
-            if np.max(forces[~equal], initial=0.0) <= largest:
+            if np.max(forces[strict], initial=0.0) <= largest:
                 return correction
             doubtful = correction
         # ten times the margin: four attempts reach far beyond any round-off that is left
         margin = 10.0 * margin
+    if doubtful is None and vi.K.blocks and not np.any(excess[rays] + margin[rays] > 0.0):
+        zero = np.zeros_like(u)
+        doubtful = Correction(zero, zero, lam, 0.0, constraints, BoundNote.UNCORRECTED)
     return doubtful
 
 
@@ -459,6 +467,10 @@ def _minimisers(
             if np.max(settled[1][~equal], initial=0.0) <= largest:
                 return
     vi = contact.vi
+    if vi.K.blocks:
+        if (settled := active_set_iterations(system, starts[-1], equal, one_by_one=True)) is not None:
+            yield settled[:2]
+        return
     program = VariationalInequality(vi.A, -(vi.B.T @ lam), -sp.csr_array(vi.B)[kept], -least)
     if (nearest := least_distance_solution(program, energy.factor, equal, starts[-1])) is not None:
         yield contact.values(nearest[0]), nearest[1]

@@ -24,7 +24,7 @@ from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.contact_form import ContactForm
 from vibench.qp.scaling import ratio
-from vibench.qp.verification import Residuals, accurate_residuals, round_off_of_terms
+from vibench.qp.verification import Residuals, accurate_residuals, complementarity, round_off_of_terms
 
 T = TypeVar("T")
 
@@ -281,18 +281,18 @@ def high_fidelity_residuals(
     unit = max(on.contact_energy(lam), least)
     if not least:
         unit = float(np.hypot(energy.norm(u) if u_energy is None else u_energy, on.force_norm(lam)))
-    violated = np.flatnonzero(excess > round_off_of_terms(on.entries, on.sizes @ np.abs(values) + np.abs(vi.g)))
+    rounded = round_off_of_terms(on.entries, on.sizes @ np.abs(values) + np.abs(vi.g))
+    violated = np.flatnonzero((excess > rounded) & vi.K.rays(len(rounded)))
     # s may be infinite where λ is zero; the force of an equality times round-off is no gap.
-    pressed = (lam > 0.0) & ~on.tied
-    gap = abs(float(lam[pressed] @ excess[pressed]))
+    gap = complementarity(vi.K, np.where(on.tied, 0.0, lam), excess)
     return Residuals.relative(on.largest_step(violated, excess[violated]), rho, gap, unit)
 
 
 def residual_multiplier(vi: VariationalInequality, energy: EnergyNorm, u: Array) -> Array:
-    """The λ ≥ 0 (m,) whose residual f − A u − Bᵀλ is the smallest in the norm of A⁻¹.
+    """The λ ∈ K (m,) whose residual f − A u − Bᵀλ is the smallest in the norm of A⁻¹.
 
-    Its KKT conditions are those of the variational inequality with the load f − A u and g = 0 where it is finite:
-    A w + Bᵀλ = f − A u, B w ≤ 0, λ ≥ 0 and λᵀB w = 0. Raises a `NumericalError` if none is found.
+    Of rays its KKT conditions are those of the variational inequality with the load f − A u and g = 0 where it is
+    finite: A w + Bᵀλ = f − A u, B w ≤ 0, λ ≥ 0 and λᵀB w = 0. Raises a `NumericalError` if none is found.
     """
-    homogeneous = VariationalInequality(vi.A, vi.f - vi.A @ u, vi.B, np.where(is_absent(vi.g), vi.g, 0.0))
-    return np.asarray(np.maximum(solve_unverified(homogeneous, energy.stiffness).lam, 0.0))
+    homogeneous = replace(vi, f=vi.f - vi.A @ u, g=np.where(is_absent(vi.g), vi.g, 0.0))
+    return vi.K.project(solve_unverified(homogeneous, energy.stiffness).lam)

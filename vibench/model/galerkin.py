@@ -207,7 +207,8 @@ def project(
     `known` has projections of members, by name, that were made at another parameter.
     """
     made = projections(Z, chi).items()
-    return VariationalInequality(**{n: known[n] if n in known else of(getattr(vi, n)) for n, of in made})
+    A, f, B, g = (known[name] if name in known else of(getattr(vi, name)) for name, of in made)
+    return VariationalInequality(A, f, B, g)
 
 
 def projected_members(

@@ -16,7 +16,6 @@ from vibench.arrays import Array
 from vibench.interfaces.absent_rows import is_absent
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
-from vibench.model.bound_terms import in_dual_set
 from vibench.qp.verification import norms_by_solutions
 from vibench.reduction import cones
 from vibench.stability.coercivity import Stability
@@ -36,9 +35,9 @@ def hsw_bounds(
 ) -> list[HSWBounds | None]:  # fmt: skip
     """Δ_u and Δ_λ of reduced u (n×P), λ (m×P), column by column at the parameters of `vis`; see above.
 
-    Infinite where β_HF over the span is zero; `None` where λ is not in W⁺ and nothing is certified, and where rows are
-    absent: the distance of B u_N − g from the cone is one in W of all rows. `residuals` are those of the pairs (n,),
-    where known.
+    Infinite where β_HF over the span is zero; `None` where λ is not in W⁺ and nothing is certified, where K has more
+    than rays, and where rows are absent: the distance of B u_N − g from the cone is one in W of all rows. `residuals`
+    are those of the pairs (n,), where known.
     """
     residuals = residuals or [vi.f - vi.A @ u[:, k] - vi.B.T @ lam[:, k] for k, vi in enumerate(vis)]
     # All representers in one block: the factor of X_V is read once.
@@ -47,7 +46,7 @@ def hsw_bounds(
     excesses = (vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis))
     return [
         None
-        if is_absent(vis[k].g).any() or not in_dual_set(lam[:, k])
+        if is_absent(vis[k].g).any() or problem.K.blocks or not problem.K.contains(lam[:, k])
         else _bound(problem.W, s, lam[:, k], float(dual_norms[k]), constants[k])
         for k, s in enumerate(excesses)
     ]

@@ -19,6 +19,7 @@ from vibench.arrays import Array, is_sound, read_only, taken
 from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces import formulations
+from vibench.interfaces.dual_sets import refuse_blocks
 from vibench.interfaces.formulations import Formulation, FormulationAnswer, FormulationModel, QuerySettings
 from vibench.interfaces.parameters import ParameterBox, outside
 from vibench.interfaces.problem import Problem, VariationalInequality
@@ -166,6 +167,7 @@ class Model:
     @cached_property
     def online(self) -> FormulationModel:
         """The model of the formulation, which answers queries; a `NumericalError` if it makes something else."""
+        refuse_blocks(self.problem.K, self.formulation.blocks, f"the formulation {type(self.formulation).__name__}")
         made = self.formulation.model(self.offline, self.built)
         if not isinstance(made, FormulationModel):
             raise NumericalError(f"the formulation made a {type(made).__name__}, expected a FormulationModel")
@@ -231,10 +233,12 @@ class Model:
         lam = self._multiplier(mu, u) if lam is None else lam
         if not (is_sound(u) and is_sound(lam)):
             return QueryStatus(Status.NONFINITE, "the reconstructed u or λ is not finite", residuals=residuals)
-        # Even round-off below zero is refused: every bound needs λ ≥ 0.
-        if lam.min(initial=0.0) < 0.0:
-            worst = f"{lam.min():.1e} in row {int(lam.argmin())}"
-            return QueryStatus(Status.FAILED, f"a broken answer: λ has negative coefficients, as {worst}")
+        # Even round-off beyond K is refused: every bound needs λ ∈ K.
+        if not (K := self.problem.K).contains(lam):
+            rows = np.abs(K.project(lam) - lam)
+            worst = f"{lam[rows.argmax()]:.1e} in row {int(rows.argmax())}"
+            what = "is outside K" if K.blocks else "has negative coefficients"
+            return QueryStatus(Status.FAILED, f"a broken answer: λ {what}, as {worst}")
         return QueryStatus(status, reason, (u, lam), residuals, spent, counts)
 
     def answered(self, mu: Array, settings: QuerySettings) -> tuple[FormulationAnswer, Seconds]:

@@ -13,6 +13,7 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError, RequestError, UnsupportedError, message_of, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces import strategies, validation
+from vibench.interfaces.dual_sets import refuse_blocks
 from vibench.interfaces.formulations import Formulation, Snapshots, axes_of
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import AdaptiveSampling, Cone, DualStrategy, PrimalStrategy, Sampling, Stop
@@ -183,10 +184,11 @@ class Reduction:
     @cached_property
     def cone(self) -> Cone:
         """The reduced cone K_R (paper, (12))."""
-        W = self.problem.W
+        W, K = self.problem.W, self.problem.K
         if self.dual is None or self.generators is None:
             return Cone(np.zeros((W.dim, 0)), np.ones(1), strategies.no_free(0))
-        return validation.check_cone(self.dual.reduce(self.snapshots.lam, W, self.generators), W)
+        refuse_blocks(K, self.dual.blocks, type(self.dual).__qualname__)
+        return validation.check_cone(self.dual.reduce(self.snapshots.lam, W, self.generators), W, K)
 
     @cached_property
     def multipliers(self) -> ConeBasis:

@@ -14,7 +14,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.interfaces.problem import VariationalInequality
-from vibench.model.bound_terms import BoundNote, CorrectionMode, in_dual_set
+from vibench.model.bound_terms import BoundNote, CorrectionMode, outside_note
 from vibench.model.certificates.base import Guarantee, contact_unknowns
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, OnlineCorrection, output_error_bound
 from vibench.model.error_bounds import CorrectedPair, ErrorBounds, bound_errors_at, corrected_pair
@@ -71,9 +71,10 @@ class Corrector:
     def in_full(self, mu: Array, u: Array, lam: Array) -> Answer:
         """The answer at high-fidelity cost."""
         # Corrections are defined for λ_N ≥ 0 only (docs/mathematics.md, "Error bounds").
-        if not in_dual_set(lam):
-            return Answer(u, lam, note=BoundNote.NOT_IN_CONE)
-        cache = assemblies(self.model.problem)
+        problem = self.model.problem
+        if not problem.K.contains(lam):
+            return Answer(u, lam, note=outside_note(problem.K))
+        cache = assemblies(problem)
         pair = corrected_pair(cache.at(mu), cache.energy_at(mu), u, lam)
         if pair is None:
             return Answer(u, lam, note=BoundNote.NO_CORRECTION)
@@ -87,7 +88,7 @@ def corrected_in_full(
 ) -> CorrectedPair | None:
     """The correction at high-fidelity cost of x (N',), α (R,), with factorisations of an assembled A."""
     u = np.asarray(model.reconstruct(mu, vi, x[:, None])[:, 0])
-    return corrected_pair(vi, cache.energy_of(vi), u, np.maximum(model.generators @ alpha, 0.0))
+    return corrected_pair(vi, cache.energy_of(vi), u, vi.K.project(model.generators @ alpha))
 
 
 def _share(omega: float, rho: float) -> float:

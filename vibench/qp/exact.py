@@ -21,6 +21,7 @@ from scipy.optimize import nnls
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.absent_rows import ABSENT, is_absent, zero_rows
+from vibench.interfaces.dual_sets import RAYS, DualSet
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
@@ -40,7 +41,8 @@ class Rows:
     # For equalities the row on the other side (k,), and the length of this row over that of the other.
     opposite: Indices
     ratio: Array
-    # Rows (m,) that need no check of their own: equalities, those parallel to them, absent and zero ones.
+    # Rows (m,) that need no check of their own: equalities, those parallel to them, absent and zero ones. Nor do those
+    # that are no rays, which no u violates.
     implied: Mask
 
     @property
@@ -57,9 +59,7 @@ class Rows:
 
     def program(self, vi: VariationalInequality) -> VariationalInequality:
         """The program `vi` with these rows alone."""
-        if len(self.kept) == len(vi.g):
-            return vi
-        return replace(vi, B=sp.csr_array(vi.B)[self.kept], g=vi.g[self.kept])
+        return vi if len(self.kept) == len(vi.g) else vi.kept(self.kept)
 
     def multipliers(self, forces: Array, count: int) -> Array:
         """Multipliers λ ≥ 0 (m,) from those (k,) of the rows that matter, of any sign on equalities."""
@@ -110,20 +110,21 @@ def _probe(count: int) -> Array:
 
 def rows_that_matter(
     B: SparseMatrix | Array, g: Array, room: Array, preferred: Array | None = None,
-    directions: Directions | None = None,
+    directions: Directions | None = None, K: DualSet = RAYS,
 ) -> Rows:  # fmt: skip
     """Find the rows of B (m×n) and g (m,) that matter: the tightest of parallel ones, one equality for opposite ones.
 
     Absent rows, and zero ones that hold, do not matter.
     Opposite rows are an equality where there is at most some `room` (m,) between them, in the unit of g. It is
     represented by the row with the larger entry of `preferred` (m,), in units of its length. `directions` are those of
-    the rows that are not absent, where they are known.
+    the rays that are not absent, where they are known. Rows of other blocks of K matter as they are.
     """
-    m = len(g)
+    m, rays = len(g), K.rays(len(g))
     dropped, equal, opposite, ratio = is_absent(g), np.zeros(m, bool), np.arange(m), np.ones(m)
     dropped |= zero_rows(B) & (g >= 0.0)
-    implied = dropped.copy()
-    directions = directions or Directions.of(B, ~dropped)
+    dropped &= rays
+    implied = dropped | ~rays
+    directions = directions or Directions.of(B, ~implied)
     if not len(directions.members):
         kept = np.flatnonzero(~dropped)
         return Rows(kept, equal[kept], kept, ratio[kept], implied)

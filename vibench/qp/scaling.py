@@ -80,7 +80,7 @@ def drive(program: VariationalInequality, rows: Array) -> Drive:
 def near_rows(program: VariationalInequality) -> Mask:
     """Constraints (m,) that are near 0 in units of the solution's length; see `near`."""
     rows = row_norms(program.B)
-    return near(program, rows, drive(program, rows))
+    return near(program, rows, drive(program, rows)) | ~program.K.rays(len(rows))
 
 
 def near(program: VariationalInequality, rows: Array, driven: Drive) -> Mask:

@@ -11,7 +11,8 @@ docs/mathematics.md). Their unit is the F of the answer; where that does not suf
 F_low = max_i (B_i u₀ − g_i)₊ / ‖B_i‖_{A⁻¹} ≤ F. Without contact, F_low = 0, it is S, S² = ‖x‖²_A + ‖Bᵀα‖²_{A⁻¹}.
 Pairs of opposite rows are equalities and belong to u₀, or a loaded tie would hide the contact; they open no gap, which
 would be their force times round-off. Whether a row is violated is decided row by row, against the round-off of its own
-s_i: a far row, as one with g_i = ∞, says nothing of the others.
+s_i: a far row, as one with g_i = ∞, says nothing of the others. A row whose multiplier has a bound is never violated:
+its gap is σ_K(s) − λᵀs.
 
 Two solutions of one program whose residuals meet an accuracy have a bounded distance. For solutions k = 1, 2 with
 α_k ≥ 0, residuals r_k = f − Ax_k − Bᵀα_k and excesses s_k = Bx_k − g, the difference d = x₁ − x₂ satisfies
@@ -35,6 +36,7 @@ from scipy.optimize import nnls
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
+from vibench.interfaces.dual_sets import RAYS, DualSet
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
@@ -116,36 +118,37 @@ def kkt_residuals(
     `inverse` is the factorisation of A where there is one already. Residuals up to the `accuracy` are good enough: F of
     the answer is their unit then, and no other one is computed. Raises a `NumericalError` if A is not definite.
     """
-    B, g, inverse = program.B, program.g, inverse or inverse_of(program.A)
+    B, g, K, inverse = program.B, program.g, program.K, inverse or inverse_of(program.A)
     residual, excess = accurate_residuals(program, x, alpha)
-    rounded = round_off(B, x, g)
-    violated = np.flatnonzero(excess > rounded)
+    rounded, rays = round_off(B, x, g), K.rays(len(g))
+    violated = np.flatnonzero((excess > rounded) & rays)
     force = np.asarray(B.T @ alpha)
     # One solve for all costs the least.
     lengths = inverse.dual_norms(np.column_stack([_dense_rows(B, violated).T, force, residual]))
     step, left, contact = _largest_step(excess[violated], lengths[:-2]), float(lengths[-1]), float(lengths[-2])
-    rows = rows_that_matter(B, g, rounded)
+    rows = rows_that_matter(B, g, rounded, K=K)
     if len(rows.equalities):
         held = inverse.holding(replace(program, f=force, g=np.zeros_like(g)), rows.equalities)
         contact = _energy(program.A, held)
     pressing = np.where(rows.tied, 0.0, alpha)
-    found = Residuals.relative(step, left, _gap(pressing, excess), contact)
+    found = Residuals.relative(step, left, complementarity(K, pressing, excess), contact)
     if found.worst <= accuracy or not np.isfinite([step, left, contact]).all():
         return found
     free, moved = _refined_solution(program.A, inverse, program.f), _refined_solution(program.A, inverse, -force)
     least = _least_contact(program, inverse, free, rows)
     unit = max(contact, least) if least else float(np.hypot(_energy(program.A, x), lengths[-2]))
-    found = Residuals.relative(step, left, _gap(pressing, excess), unit)
+    found = Residuals.relative(step, left, complementarity(K, pressing, excess), unit)
     # What rounding leaves of x says nothing of α, which is then judged with v = −A⁻¹Bᵀα, the x of no round-off being
     # u₀ + v: the factor allows for sums of as many terms as a reduced program has.
     if not left <= 64.0 * EPS * float(np.sqrt(np.abs(x) @ (abs(program.A) @ np.abs(x)))):
         return found
     excess = np.asarray(extended(B) @ (sum(free) + sum(moved)) - g, dtype=float)
-    violated = np.flatnonzero(excess > 0.0)
+    violated = np.flatnonzero((excess > 0.0) & rays)
     rest = np.asarray(-force - extended(program.A) @ sum(moved), dtype=float)
     lengths = inverse.dual_norms(np.column_stack([_dense_rows(B, violated).T, rest]))
     step = _largest_step(excess[violated], lengths[:-1])
-    return min(found, Residuals.relative(step, float(lengths[-1]), _gap(pressing, excess), unit), key=lambda r: r.worst)
+    gap = complementarity(K, pressing, excess)
+    return min(found, Residuals.relative(step, float(lengths[-1]), gap, unit), key=lambda r: r.worst)
 
 
 def _largest_step(excess: Array, lengths: Array) -> float:
@@ -154,9 +157,13 @@ def _largest_step(excess: Array, lengths: Array) -> float:
     return float(np.max(steps, initial=0.0))
 
 
-def _gap(alpha: Array, excess: Array) -> float:
-    pressed = alpha > 0.0  # elsewhere s may be infinite
-    return abs(float(alpha[pressed] @ excess[pressed]))
+def complementarity(K: DualSet, lam: Array, excess: Array) -> float:
+    """The |λᵀs| of rays, whose s = B u − g (m,) may be infinite where λ is zero, and σ_K(s) − λᵀs of other blocks."""
+    if not K.blocks:
+        pressed = lam > 0.0
+        return abs(float(lam[pressed] @ excess[pressed]))
+    rays = K.rays(len(lam))
+    return complementarity(RAYS, lam[rays], excess[rays]) + K.gap(np.where(rays, 0.0, lam), -excess)
 
 
 def _dense_rows(B: SparseMatrix | Array, rows: Indices) -> Array:

@@ -6,6 +6,7 @@ from .cones import TIE as TIE
 from .cones import GrowingCone as GrowingCone
 from .cones import LazyDistances as LazyDistances
 from .cones import LazyMaximum as LazyMaximum
+from .cones import hull_distances as hull_distances
 from .cones import refuse_negative as refuse_negative
 from .cubatures import Cubature as Cubature
 from .cubatures import cubature as cubature

@@ -76,6 +76,19 @@ def project_on_cone(
     return _project_whitened(W.whiten(generators), W.whiten(theta))
 
 
+def hull_distances(points: Array, targets: Array) -> Array:
+    """Distances (k,) of targets (m×k) from the convex hull of zero and points (m×r), by nonnegative least squares.
+
+    Points and targets are whitened. The weight of zero is one more unknown, and a row that is heavy beside all others
+    makes the sum of the weights 1.
+    """
+    heavy = 1e6 * float(np.max(np.abs(points), initial=0.0))
+    sums = np.full((1, points.shape[1] + 1), heavy)
+    system = np.vstack([np.column_stack([points, np.zeros(len(points))]), sums])
+    weights = np.column_stack([nnls(system, np.append(target, heavy))[0] for target in targets.T])
+    return np.asarray(np.linalg.norm(points @ weights[:-1] - targets, axis=0))
+
+
 def project_on_orthant(functional: Array, W: InnerProduct) -> Array:
     """Projection (m,) on W⁺, nonnegative coefficients, of the Riesz representer of a functional (m,) in the W norm.
 

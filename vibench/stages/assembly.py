@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vibench.arrays import Array
+from vibench.interfaces.dual_sets import BlockKind, Blocks, DualSet
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.model.affine import AffineMember, Evaluation
@@ -21,7 +22,7 @@ from vibench.stages.enrichment import GrowthStage
 from vibench.stages.formulation import FormulationStage
 from vibench.study.parameter_sets import ParameterSet
 
-storable(VariationalInequality, ExactSolution)
+storable(VariationalInequality, DualSet, Blocks, BlockKind, ExactSolution)
 
 
 @dataclass(frozen=True)

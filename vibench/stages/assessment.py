@@ -39,7 +39,7 @@ def pair_columns(
     forces = measured.of_stiffness(energies, u)
     residuals = [vi.f - force - vi.B.T @ of_lam for vi, force, of_lam in zip(vis, forces.T, lam.T, strict=True)]
     proved = [(one.coercivity, one.energy_inf_sup) for one in constants]
-    bounds = error_bounds(problem.V, vis, energies, proved, u, lam, reference.lam > 0.0, residuals)
+    bounds = error_bounds(problem.V, vis, energies, proved, u, lam, problem.K.free(reference.lam), residuals)
     hsw = hsw_bounds(problem, vis, constants, u, lam, residuals)
     errors = measured.errors(problem, vis, energies, reference, u, lam)
     rows = [_columns(*one) for one in zip(errors, bounds, hsw, strict=True)]

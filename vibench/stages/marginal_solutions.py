@@ -117,7 +117,7 @@ def _starts(problem: Problem, reference: TimedSnapshots) -> Iterator[Mask]:
             # The first of a part starts from the nearest after it, or from its own where it is the only one.
             others = slice(first, k) if k > first else slice(min(first + 1, end - 1), end)
             distances = np.linalg.norm((reference.mu[others] - reference.mu[k]) / width, axis=1)
-            yield reference.lam[:, others][:, int(np.argmin(distances))] > 0.0
+            yield problem.K.free(reference.lam[:, others][:, int(np.argmin(distances))])
 
 
 def parts_alike(seconds: Array, parts: int) -> tuple[tuple[int, ...], ...]:

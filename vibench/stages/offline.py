@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from vibench.interfaces.dual_sets import refuse_blocks
 from vibench.interfaces.strategies import Cone, Stop
 from vibench.interfaces.validation import check_cone
 from vibench.plugins.plugin import Plugin
@@ -79,12 +80,13 @@ class ConeStage(Stage):
 
     def run(self, store: Store) -> Result:
         """Reduce; histories are the projection error and e_orth over the number of generators."""
-        snapshots, W = gather(store, self.inputs()).lam, build_problem(self.problem).W
-        strategy = self.dual.create()
+        snapshots, problem = gather(store, self.inputs()).lam, build_problem(self.problem)
+        strategy, W, K = self.dual.create(), problem.W, problem.K
+        refuse_blocks(K, strategy.blocks, f"the dual strategy '{self.dual.name}'")
         # Verification is no part of the offline time.
         with faults_of(self.dual):
             cone, reducing = timed(lambda: inside(strategy.reduce)(snapshots, W, replace(self.stop)))
-            cone = check_cone(cone, W)
+            cone = check_cone(cone, W, K)
         prepared, preparing = timed(lambda: cone_basis(cone.generators, W, cone.free))
         orthogonal = orthogonality(cone.generators, W, cone.free)
         histories = History.of("cone", "error", cone.errors), History.of("cone", "e_orth", orthogonal)

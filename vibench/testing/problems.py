@@ -443,7 +443,7 @@ def constants(case: ProblemCase) -> Iterator[str]:
 
 
 def high_fidelity_solution(case: ProblemCase) -> Iterator[str]:
-    """High-fidelity solutions exist; their multipliers lie in W⁺ and are not all zero."""
+    """High-fidelity solutions exist; their multipliers lie in K and are not all zero."""
     mus, solver = training_parameters(case.plugin), active_set.HighFidelitySolver(case.plugin)
     solved, contacts = list[active_set.HighFidelitySolution](), 0
     # Five evenly spread parameters; those between them only while no constraint is active.
@@ -456,11 +456,12 @@ def high_fidelity_solution(case: ProblemCase) -> Iterator[str]:
         except NumericalError as error:
             raise ConformanceError(f"no solution: {error}") from error
         # Exactly: the active set method leaves no negative multipliers.
-        if np.min(answer.lam) < 0.0:
-            yield f"the multiplier is not in W⁺ {at(mus[k])}: entry {np.argmin(answer.lam)} is {np.min(answer.lam):.1e}"
+        if not (K := case.plugin.K).contains(answer.lam):
+            away = np.abs(K.project(answer.lam) - answer.lam)
+            yield f"the multiplier is not in K {at(mus[k])}: entry {away.argmax()} is {answer.lam[away.argmax()]:.1e}"
             return
         solved.append(answer)
-        contacts += bool(np.any(answer.lam > 0.0))
+        contacts += bool(answer.lam.any())
     if not contacts:
         yield f"no constraint is active at any of {len(solved)} training parameters; is B u ≤ g the admissible side?"
     elif all(np.all(each.lam > 0.0) for each in solved):

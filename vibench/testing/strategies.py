@@ -30,7 +30,7 @@ from vibench.interfaces.strategies import (
 from vibench.interfaces.validation import check_cone, check_enrichment
 from vibench.linalg.inner_product import InnerProduct
 from vibench.offline.sample_problem import sample_offline, sample_snapshots
-from vibench.reduction.cones import project_on_cone
+from vibench.reduction.cones import hull_distances, project_on_cone
 from vibench.reduction.nested import NestedStrategy, grow_through
 from vibench.stages.artefacts import dumps, loads
 from vibench.stages.enrichment import BuiltEnrichment
@@ -130,6 +130,9 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
         """Projection errors (P,) on the cone of the first r generators, relative to the largest norm of a snapshot."""
         largest = float(np.max(self.space.norm(snapshots), initial=0.0)) or 1.0
         chi = rays(cone.generators[:, :r], cone.free[:r])
+        if cone.gauges is not None:
+            points = self.space.whiten(chi / cone.gauges[:r])
+            return hull_distances(points, self.space.whiten(snapshots)) / largest
         return np.array([project_on_cone(chi, theta, self.space).distance for theta in snapshots.T]) / largest
 
     checks = (

@@ -115,7 +115,8 @@ class HyperReducedContact(FixedSpacesModel):
     def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
         """The program of the reduced domain."""
         members = self._projected(mu) | (self._domain.at(mu) if self._domain else {})
-        return solved(settings, VariationalInequality(**members))
+        A, f, B, g = (members[name] for name in "AfBg")
+        return solved(settings, VariationalInequality(A, f, B, g))
 
 
 class ReducedDomain:

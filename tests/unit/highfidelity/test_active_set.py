@@ -1,5 +1,6 @@
 import pickle
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,7 +76,11 @@ def test_a_cycling_active_set_is_helped_and_the_help_is_recorded(monkeypatch: py
     alone, iterate = active_set.solve_high_fidelity(vi), active_set.active_set_iterations
     assert alone.fallback == ""
     cycles_at_first = iter([None])
-    monkeypatch.setattr(active_set, "active_set_iterations", lambda *given: next(cycles_at_first, iterate(*given)))
+
+    def iterates(*given: Any, **named: Any) -> Any:
+        return next(cycles_at_first, iterate(*given, **named))
+
+    monkeypatch.setattr(active_set, "active_set_iterations", iterates)
     helped = active_set.solve_high_fidelity(vi)
     assert "cycled" in helped.fallback
     assert np.allclose(helped.u, alone.u, atol=1e-12)

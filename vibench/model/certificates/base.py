@@ -201,6 +201,8 @@ class CertificateBase:
 
 def unsupported(problem: Problem, members: Mapping[str, AffineMember]) -> str:
     """Reason why reduced models of a problem cannot be certified at online cost; "" if they can."""
+    if problem.K.blocks:
+        return f"certificates know λ ≥ 0 alone; K has {problem.K.names()}"
     if not problem.has_contact:
         return "the problem does not assemble its constraint on its contact unknowns (`contact_dofs` and `contact`)"
     count = len(contact_unknowns(problem))

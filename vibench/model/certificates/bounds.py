@@ -45,12 +45,13 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import UnsupportedError
+from vibench.interfaces.dual_sets import RAYS
 from vibench.interfaces.parameters import outside
 from vibench.interfaces.problem import Contact, Problem
 from vibench.linalg import EPS, UNIT_ROUND_OFF
 from vibench.linalg.factorisations import implementation
 from vibench.model.affine import AffineMember
-from vibench.model.bound_terms import BoundNote, BoundTerms, CorrectionMode, in_dual_set
+from vibench.model.bound_terms import BoundNote, BoundTerms, CorrectionMode
 from vibench.model.certificates.base import CertificateBase, Guarantee, contact_unknowns, is_exact
 from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction, unknowns_near
 from vibench.model.certificates.prepared_correction import PreparedCorrections, prepare_corrections
@@ -202,7 +203,7 @@ class OnlineCertificate:
 
     def _bound(self, query: _Query, alpha: Array) -> OnlineBound:
         base, lam, lower, upper = self.base, query.lam, query.lower, query.upper
-        if not in_dual_set(lam):
+        if not RAYS.contains(lam):
             return OnlineBound.none(BoundNote.NOT_IN_CONE)
         if not base.is_exact and outside(query.problem.parameters, query.mu).any():
             return OnlineBound.none(BoundNote.OUTSIDE)

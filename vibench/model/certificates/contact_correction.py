@@ -31,10 +31,11 @@ import scipy.sparse as sp
 from scipy.linalg.lapack import dposv, dpotrf, dpotrs
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.interfaces.dual_sets import RAYS
 from vibench.interfaces.problem import Contact
 from vibench.linalg import EPS
 from vibench.linalg.definite import BlockDiagonal
-from vibench.model.bound_terms import Equalities, dual_gap, first_margin
+from vibench.model.bound_terms import Equalities, first_margin
 from vibench.qp.exact import least_distance, rows_that_matter
 from vibench.qp.scaling import row_norms
 
@@ -223,7 +224,7 @@ class _Program:
                     # A force pulls if ν is negative beyond the round-off in ν − λ + λ.
                     known = None if np.any(nu < -8.0 * EPS * lam) else pushing
                     away = self.whole.error * norm + unit * float(self.reach @ (pushing + lam)) / self.gamma
-                    kappa, gap = dual_gap(lam, most), dual_gap(pushing, most)
+                    kappa, gap = RAYS.gap(lam, most), RAYS.gap(pushing, most)
                     return ContactCorrection(self.unknowns, load, norm, kappa, known, gap, 0.0, away)
                 if np.any(lacking[~self.near] > 0.0):
                     return None
@@ -311,7 +312,7 @@ class _Program:
                 nu = rows.multipliers(np.where(rows.equal, forces, np.maximum(forces, 0.0)) / lengths, len(lam))
                 # slack may be infinite on absent rows, where multipliers are zero
                 most = slack + rounded
-                kappa, gap = (dual_gap(one, np.where(one > 0.0, most, 0.0)) + float(one @ moved) for one in (lam, nu))
+                kappa, gap = (RAYS.gap(one, np.where(one > 0.0, most, 0.0)) + float(one @ moved) for one in (lam, nu))
                 c = scipy.linalg.solve_triangular(L, y, lower=True, trans="T")
                 norm = float(np.linalg.norm(y)) * (1.0 + loss)
                 # also the round-off in the forces of ν − λ

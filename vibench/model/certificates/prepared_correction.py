@@ -24,9 +24,10 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.interfaces.dual_sets import RAYS
 from vibench.linalg import EPS
 from vibench.linalg.definite import connected_blocks
-from vibench.model.bound_terms import dual_gap, first_margin
+from vibench.model.bound_terms import first_margin
 from vibench.model.certificates.contact_correction import ContactCompliance, complementary
 
 
@@ -72,7 +73,7 @@ class PreparedCorrections:
             return None
         _, a, norm, most = found
         rounded = 2.0 * self.terms * EPS * float(self.reach @ np.abs(a))
-        return a @ self.directions, norm, dual_gap(lam, most), rounded
+        return a @ self.directions, norm, RAYS.gap(lam, most), rounded
 
     def multiplier(
         self, theta: float, g: Array, g_size: Array, y: Array, lam: Array, gamma: float
@@ -87,7 +88,7 @@ class PreparedCorrections:
         (nu, _, norm, most), on_all = found, lam.copy()
         on_all[self.rows] = np.maximum(nu, 0.0)
         away = 8.0 * EPS * abs(theta) * float(self.reach @ (on_all + lam).take(self.rows)) / gamma
-        return on_all, norm, dual_gap(on_all, most), away + self.error * norm
+        return on_all, norm, RAYS.gap(on_all, most), away + self.error * norm
 
     def _feasible(
         self, B: float | SparseMatrix, g: Array, g_size: Array, y: Array, lam: Array, gamma: float

@@ -1,0 +1,226 @@
+"""Dual sets: the closed convex set K of the multipliers, a product of blocks of rows.
+
+The problem is min ½uᵀA u − fᵀu + σ_K(B u − g), with σ_K(y) = sup { λᵀy : λ ∈ K }. A row by itself is a ray, λ ≥ 0:
+contact, σ_K = 0 where B u ≤ g. The other blocks have
+
+    interval  |λ| ≤ c      one row      σ_K(y) = c |y|             friction with a given bound in the plane
+    disc      |λ| ≤ c      k rows       σ_K(y) = c |y|             the same in space, Bingham flow
+    cone      |λ₁| ≤ λ₂    k + 1 rows   0 where |y₁| ≤ −y₂, or ∞   bounds of gradients, Coulomb's law in space
+
+where |·| is Euclidean and λ₂ is the last row of a cone. Rows and radii do not depend on the parameter. A bound c(mu)
+that does belongs into B and g: the multipliers θ = λ / c(mu) are then in one set ("Dual sets" in docs/mathematics.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from typing import Annotated
+
+import numpy as np
+
+from vibench.arrays import Array, Indices, Mask, read_only
+from vibench.errors import RequestError, UnsupportedError
+from vibench.linalg import EPS
+from vibench.signatures import bordered
+
+
+class BlockKind(StrEnum):
+    """Kinds of blocks of a dual set; rows in no block are rays."""
+
+    RAY = "ray"
+    INTERVAL = "interval"
+    DISC = "disc"
+    CONE = "cone"
+
+
+@bordered
+@dataclass(frozen=True)
+class Blocks:
+    """Blocks of one kind and size: their rows (b×k), and radii c > 0 (b,), which cones do not have."""
+
+    kind: BlockKind
+    rows: Annotated[Indices, "b", "k"]
+    radii: Annotated[Array, "b"] | None = None
+
+    def __post_init__(self) -> None:
+        size = self.rows.shape[1]
+        if self.kind is BlockKind.RAY:
+            raise RequestError("rows in no block are rays: there are no blocks of them")
+        if (self.radii is None) != (self.kind is BlockKind.CONE):
+            raise RequestError("intervals and discs have radii, and cones have none")
+        if self.radii is not None and not (np.isfinite(self.radii) & (self.radii > 0.0)).all():
+            raise RequestError("a radius is not positive and finite; leave a row without friction out of B")
+        if (self.kind is BlockKind.INTERVAL and size != 1) or (self.kind is BlockKind.CONE and size < 2):
+            raise RequestError(f"{self.kind.value}s have {'one row' if size != 1 else 'two rows or more'}, not {size}")
+        object.__setattr__(self, "rows", read_only(self.rows))
+
+    def parts(self, values: Array) -> tuple[Array, Array]:
+        """Lengths (b,) of the rows of blocks in values (m,), and of a cone the last row (b,) apart, or the radii."""
+        inside = values[self.rows]
+        if self.radii is None:
+            return np.linalg.norm(inside[:, :-1], axis=1), inside[:, -1]
+        return np.linalg.norm(inside, axis=1), self.radii
+
+    def project(self, values: Array) -> Array:
+        """The nearest points (b×k) of the blocks, in the Euclidean norm of the rows."""
+        inside, (lengths, limits) = values[self.rows], self.parts(values)
+        positive = np.where(lengths > 0.0, lengths, 1.0)
+        if self.kind is BlockKind.INTERVAL:
+            return np.clip(inside, -limits[:, None], limits[:, None])
+        if self.radii is not None:
+            # Round-off must not leave a point outside.
+            share = np.where(lengths > limits, (1.0 - 4.0 * EPS) * limits / positive, 1.0)
+            return np.asarray(inside * share[:, None])
+        # inside, in the polar cone, or on the boundary, whose nearest point has the height (|λ₁| + λ₂) / 2
+        height = np.where(lengths <= limits, limits, np.maximum(0.5 * (lengths + limits), 0.0))
+        share = np.where(lengths <= limits, 1.0, (1.0 - 4.0 * EPS) * height / positive)
+        return np.column_stack([inside[:, :-1] * share[:, None], height])
+
+
+@dataclass(frozen=True, eq=False)
+class DualSet:
+    """The set K of the multipliers of m rows: these blocks, and a ray for every other row."""
+
+    blocks: tuple[Blocks, ...] = ()
+
+    def __post_init__(self) -> None:
+        rows = [block.rows.ravel() for block in self.blocks]
+        taken = np.concatenate(rows) if rows else np.zeros(0, np.intp)
+        if len(np.unique(taken)) < len(taken):
+            raise RequestError("a row of the dual set is in two blocks")
+
+    @classmethod
+    def intervals(cls, rows: Indices, radius: float | Array) -> DualSet:
+        """The set with |λ_i| ≤ `radius` in some rows (k,)."""
+        radii = np.broadcast_to(np.asarray(radius, float), np.shape(rows)).copy()
+        return cls((Blocks(BlockKind.INTERVAL, np.asarray(rows, np.intp)[:, None], radii),) if len(rows) else ())
+
+    @property
+    def kinds(self) -> frozenset[BlockKind]:
+        """Kinds of blocks other than rays."""
+        return frozenset(block.kind for block in self.blocks)
+
+    @cached_property
+    def _blocked(self) -> Indices:
+        return np.concatenate([block.rows.ravel() for block in self.blocks]) if self.blocks else np.zeros(0, np.intp)
+
+    def rays(self, count: int) -> Mask:
+        """Rows (m,) that are rays, of so many."""
+        found = np.ones(count, bool)
+        found[self._blocked] = False
+        return found
+
+    def radii(self, count: int) -> Array:
+        """The c (m,) with |λ| ≤ c of intervals, infinite in all other rows."""
+        found = np.full(count, np.inf)
+        for block in self.blocks:
+            if block.kind is BlockKind.INTERVAL and block.radii is not None:
+                found[block.rows[:, 0]] = block.radii
+        return found
+
+    def support(self, values: Array) -> float:
+        """σ_K(y) of y (m,), infinite outside its domain."""
+        total = np.inf if values[self.rays(len(values))].max(initial=0.0) > 0.0 else 0.0
+        for block in self.blocks:
+            lengths, limits = block.parts(values)
+            if block.radii is None:
+                total += 0.0 if (lengths <= -limits).all() else np.inf
+            else:
+                total += float(limits @ lengths)
+        return float(total)
+
+    def gauge(self, lam: Array) -> float:
+        """The smallest γ ≥ 0 with λ ∈ γ K for λ (m,); infinite where there is none."""
+        largest = np.inf if lam[self.rays(len(lam))].min(initial=0.0) < 0.0 else 0.0
+        for block in self.blocks:
+            lengths, limits = block.parts(lam)
+            if block.radii is None:
+                largest = largest if (lengths <= limits).all() else np.inf
+            else:
+                largest = max(largest, float(np.max(lengths / limits, initial=0.0)))
+        return float(largest)
+
+    def contains(self, lam: Array) -> bool:
+        """Whether λ (m,) is in K, without any round-off; not where one of them is no number."""
+        if not self.blocks:
+            return not lam.min(initial=0.0) < 0.0
+        return bool(self.gauge(lam) <= 1.0)
+
+    def project(self, lam: Array) -> Array:
+        """The nearest point (m,) of K to λ, in the Euclidean norm of the rows."""
+        found = np.maximum(lam, 0.0)
+        for block in self.blocks:
+            found[block.rows] = block.project(lam)
+        return np.asarray(found)
+
+    def gap(self, lam: Array, slack: Array, round_off: Array | None = None) -> float:
+        """An upper bound of σ_K(y) − λᵀy for λ ∈ K and y (m,) = −`slack`, which is feasible where rows are rays.
+
+        `round_off` (m,) bounds that of y; without it the bound is the value.
+        """
+        rays = self.rays(len(lam)) if self.blocks else slice(None)
+        error = np.zeros_like(slack) if round_off is None else round_off
+        # round-off may leave a negative product of numbers that vanish in pairs
+        total = max(0.0, float(lam[rays] @ (slack + error)[rays]))
+        for block in self.blocks:
+            lengths, limits = block.parts(-slack)
+            own = np.einsum("bk,bk->b", lam[block.rows], slack[block.rows])
+            own += limits * lengths if block.radii is not None else 0.0
+            away = np.linalg.norm(error[block.rows], axis=1)
+            reach = np.linalg.norm(lam[block.rows], axis=1) + (limits if block.radii is not None else 0.0)
+            # `own` may be a small difference of terms with a round-off of their own
+            away += 0.0 if round_off is None else (4.0 + block.rows.shape[1]) * EPS * lengths
+            total += float(np.sum(np.maximum(own, 0.0) + reach * away))
+        return total
+
+    def free(self, lam: Array) -> Mask:
+        """Rows inside their blocks, where B u = g: rays with λ > 0, intervals with |λ| < c, for λ (m,) or (m×P)."""
+        if not self.blocks:
+            return np.asarray(lam > 0.0)
+        count, columns = len(lam), (1,) * (lam.ndim - 1)
+        rays, radii = self.rays(count).reshape(count, *columns), self.radii(count).reshape(count, *columns)
+        return np.asarray(np.where(rays, lam > 0.0, np.isfinite(radii) & (np.abs(lam) < radii)))
+
+    def of(self, rows: Indices, count: int) -> DualSet:
+        """The set of some rows (k,) of `count`, rising; blocks are in them as a whole, or not at all."""
+        if not self.blocks:
+            return self
+        place = np.full(count, -1, np.intp)
+        place[rows] = np.arange(len(rows))
+        kept = []
+        for block in self.blocks:
+            inside = (place[block.rows] >= 0).all(axis=1)
+            radii = None if block.radii is None else block.radii[inside]
+            kept += [Blocks(block.kind, place[block.rows[inside]], radii)] if inside.any() else []
+        return DualSet(tuple(kept))
+
+    def names(self) -> str:
+        """The kinds of the blocks in words."""
+        return " and ".join(f"{kind.value}s" for kind in sorted(self.kinds)) or "rays"
+
+    def __eq__(self, other: object) -> bool:
+        """Whether blocks are equal in kind, rows and radii."""
+        if not isinstance(other, DualSet) or len(self.blocks) != len(other.blocks):
+            return False
+        pairs = zip(self.blocks, other.blocks, strict=True)
+        return all(
+            a.kind is b.kind and np.array_equal(a.rows, b.rows) and np.array_equal(a.radii, b.radii)  # type: ignore[arg-type]
+            for a, b in pairs
+        )
+
+    def __hash__(self) -> int:
+        return hash(tuple((block.kind, block.rows.shape) for block in self.blocks))
+
+
+RAYS = DualSet()
+"""The dual set of contact: λ ≥ 0."""
+
+
+def refuse_blocks(K: DualSet, known: Collection[BlockKind], what: str) -> None:
+    """Raise an `UnsupportedError` if K has blocks that are neither rays nor of the kinds that something knows."""
+    if not K.kinds <= set(known):
+        others = " and ".join(f"{kind.value}s" for kind in sorted(known))
+        raise UnsupportedError(f"{what} knows {f'rays and {others}' if others else 'λ ≥ 0 alone'}; K has {K.names()}")
