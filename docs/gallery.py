@@ -18,6 +18,7 @@ OPTIONS = {
     "radial-obstacle": {},
     "bearing": {},
     "american-put": {},
+    "tresca": {"resolution": "coarse"},
 }
 
 

@@ -1,20 +1,23 @@
-"""Negative control: a linear space of multipliers, without any sign."""
+"""A linear space of multipliers: for contact a negative control, for friction the section of K with it."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from vibench import Array, Cone, DualStrategy, InnerProduct, Stop
+from vibench import Array, BlockKind, Cone, DualStrategy, InnerProduct, Stop
 from vibench.linalg import RANK_RTOL, svd
 
 
 class PODDual(DualStrategy):
-    """Negative control, not to be used: POD of the multipliers, as for variational equations.
+    """POD of the multipliers, as for variational equations. All generators are free in sign.
 
-    λ ≥ 0 is not enforced: all generators are free in sign, reduced inequalities become equalities, and reduced contact
-    pressures may be negative. Of all linear spaces of its size this one has the smallest mean square projection error
-    (equations (10), (11) of Niakh et al. 2022, in W).
+    With the formulation "mixed" it is a negative control: reduced inequalities become equalities, and reduced contact
+    pressures may be negative. The formulation "dual-program" keeps multipliers in K: its set is the section of K. Of
+    all linear spaces of its size this one has the smallest mean square projection error (equations (10), (11) of Niakh
+    et al. 2022, in W).
     """
+
+    blocks = (BlockKind.INTERVAL,)
 
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
         """Leading modes, until the largest relative distance of a snapshot from their span is small enough."""

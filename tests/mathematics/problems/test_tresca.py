@@ -1,0 +1,131 @@
+"""Partial slip against Cattaneo's and Mindlin's closed form, and reduced models in its dual set."""
+
+import numpy as np
+import pytest
+
+from vibench import (
+    Formulation,
+    HighFidelitySolver,
+    Reduction,
+    Snapshots,
+    Stop,
+    UnsupportedError,
+)
+from vibench.model.error_bounds import corrected_pair
+from vibench.offline.assemblies import assemblies
+from vibench.offline.sample_problem import MovingSupport
+from vibench_problems.tresca import Tresca
+from vibench_strategies.cpg import CPG
+from vibench_strategies.formulations.dual_program import DualProgram
+from vibench_strategies.formulations.mixed import Mixed
+from vibench_strategies.hull_greedy import HullGreedy
+from vibench_strategies.offline_pga import OfflinePGA
+from vibench_strategies.online_supremizers import OnlineSupremizers
+from vibench_strategies.pod_dual import PODDual
+
+SHIFTS = (0.2, 0.4, 0.6, 0.8, 0.95)
+
+
+@pytest.fixture(scope="module")
+def coarse() -> Tresca:
+    return Tresca("coarse")
+
+
+@pytest.fixture(scope="module")
+def snapshots(coarse: Tresca) -> Snapshots:
+    solver, mus = HighFidelitySolver(coarse), coarse.parameters.grid(4, 9)
+    solved = [solver.solve(mu) for mu in mus]
+    return Snapshots(mus, np.column_stack([s.u for s in solved]), np.column_stack([s.lam for s in solved]))
+
+
+def differences(problem: Tresca, half_width: float = 1.0) -> list[tuple[float, float]]:
+    """Differences of force (over its limit) and of stick half-width from the closed form, at five shifts."""
+    solver, found = HighFidelitySolver(problem), []
+    for shift in SHIFTS:
+        mu = np.array([half_width, shift])
+        solution, exact = solver.solve(mu), problem.exact(mu)
+        pair = mu[None], solution.u[:, None], solution.lam[:, None]
+        force, stick = (float(output.values(*pair)[0]) for output in problem.outputs)
+        found.append((abs(force / problem.limit(mu) - exact.force), abs(stick - exact.stick)))
+    return found
+
+
+def test_force_and_stick_zone_are_those_of_the_closed_form(coarse: Tresca) -> None:
+    # The half-width 0.63 lies inside an element.
+    for half_width, most in ((1.0, 5e-3), (0.63, 1e-2)):
+        for force, stick in differences(coarse, half_width):
+            assert force < most
+            assert stick <= 0.1
+    exact = coarse.exact(np.array([1.0, -0.4]))
+    assert exact.force == pytest.approx(-0.4273, abs=1e-3)
+    assert exact.stick == pytest.approx(np.sqrt(1.0 - 0.4273), abs=1e-3)
+    assert coarse.exact(np.array([0.7, 0.0])).stick == pytest.approx(0.7)
+
+
+def test_errors_of_the_force_fall_with_the_mesh(coarse: Tresca) -> None:
+    finer = Tresca("medium")
+    means = [np.mean([force for force, _ in differences(problem)]) for problem in (coarse, finer)]
+    assert means[1] < 0.5 * means[0]
+
+
+@pytest.mark.long
+def test_paper_size_is_within_an_element_of_the_closed_form() -> None:
+    for force, stick in differences(Tresca("paper")):
+        assert force < 5e-4
+        assert stick <= 1.0 / 80.0
+
+
+@pytest.mark.parametrize("dual", [PODDual(), HullGreedy()])
+@pytest.mark.parametrize("primal", [OnlineSupremizers(), OfflinePGA()])
+def test_reduced_multipliers_stay_in_the_set(coarse, snapshots, dual, primal) -> None:  # type: ignore[no-untyped-def]
+    tolerance = 0.99 if primal.takes_tolerance else None
+    phase = Reduction(
+        coarse, dual, primal, Stop(size=10), Stop(size=5), tolerance, formulation=DualProgram(), accuracy=1e-7
+    ).given(snapshots=snapshots)
+    mu = np.array([0.8, 0.55])
+    answer, reference = phase.model.solve(mu), HighFidelitySolver(coarse).solve(mu)
+    assert answer.status.value == "ok"
+    assert coarse.K.contains(answer.lam)
+    assert coarse.V.norm(answer.u - reference.u) < 0.05 * coarse.V.norm(reference.u)
+    assert coarse.W.norm(answer.lam - reference.lam) < 0.3 * coarse.W.norm(reference.lam)
+    # The corrected pair solves the problem but for the residual.
+    pair = corrected_pair(assemblies(coarse).at(mu), assemblies(coarse).energy_at(mu), answer.u, answer.lam)
+    assert pair is not None
+    assert coarse.W.norm(pair.lam - reference.lam) < 0.2 * coarse.W.norm(answer.lam - reference.lam)
+
+
+def test_without_an_enrichment_that_is_needed_the_answer_says_so(coarse: Tresca, snapshots: Snapshots) -> None:
+    phase = Reduction(coarse, PODDual(), None, Stop(size=3), Stop(size=5), formulation=DualProgram())
+    answer = phase.given(snapshots=snapshots).model.solve(np.array([0.8, 0.55]))
+    assert answer.status.value == "failed"
+    assert "is singular: enrich V_N" in answer.reason
+
+
+def test_for_contact_the_dual_program_answers_as_the_mixed_one() -> None:
+    def model(formulation: Formulation):  # type: ignore[no-untyped-def]
+        sizes = Stop(size=5), Stop(size=4)
+        return Reduction(MovingSupport(), CPG(), OnlineSupremizers(), *sizes, formulation=formulation).model
+
+    mixed, dual = model(Mixed()).solve([0.03, 0.02]), model(DualProgram()).solve([0.03, 0.02])
+    assert dual.status.value == mixed.status.value == "ok"
+    assert np.allclose(dual.lam, mixed.lam, atol=1e-6 * np.abs(mixed.lam).max())
+    assert np.allclose(dual.u, mixed.u, atol=1e-6 * np.abs(mixed.u).max())
+
+
+def test_what_knows_contact_alone_says_so(coarse: Tresca, snapshots: Snapshots) -> None:
+    sizes = Stop(size=3), Stop(size=3)
+    with pytest.raises(UnsupportedError, match="CPG knows λ ≥ 0 alone; K has intervals"):
+        Reduction(coarse, CPG(), None, *sizes).given(snapshots=snapshots).cone  # noqa: B018
+    mixed = Reduction(coarse, PODDual(), None, *sizes).given(snapshots=snapshots)
+    with pytest.raises(UnsupportedError, match="the formulation Mixed knows λ ≥ 0 alone; K has intervals"):
+        mixed.model.solve([0.8, 0.5])
+    reduced = Reduction(coarse, PODDual(), None, *sizes, assembly="reduced").given(snapshots=snapshots)
+    with pytest.raises(UnsupportedError, match="certificates know λ ≥ 0 alone; K has intervals"):
+        reduced.certificate  # noqa: B018
+
+
+def test_the_friction_coefficient_may_be_a_parameter() -> None:
+    problem = Tresca(6, friction="parameter")
+    assert problem.parameters.dim == 3
+    weak, strong = (problem.exact(np.array([0.8, 0.6, f])) for f in (0.3, 0.5))
+    assert strong.stick > weak.stick
