@@ -25,6 +25,7 @@ from .highfidelity.active_set import solve_high_fidelity as solve_high_fidelity
 from .interfaces.absent_rows import is_absent as is_absent
 from .interfaces.affine import AffineSum as AffineSum
 from .interfaces.affine_problem import AffineProblem as AffineProblem
+from .interfaces.contact_source import ContactSource as ContactSource
 from .interfaces.formulations import Formulation as Formulation
 from .interfaces.formulations import FormulationAnswer as FormulationAnswer
 from .interfaces.formulations import FormulationModel as FormulationModel

@@ -107,7 +107,7 @@ def certify(model: vibench.Model, file: Path, tolerance: float) -> tuple[Certify
     """The C source of a model: the code, u, λ and four bounds at a parameter, corrected or not; what it is made of."""
     whole = export_model(model, file, tolerance=tolerance, evaluations=6000, c=True)
     arrays, found = whole.arrays, library(file.with_suffix(".c"), PLAIN)
-    (rows, loads), basis = arrays["certificate_responses"].shape, arrays["basis"]
+    rows, loads, basis = len(arrays["generators"]), len(arrays["certificate_rows"]), arrays["basis"]
     found.model_of_contact.restype = ctypes.c_double
 
     def certified(mu: np.ndarray, corrected: bool) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
@@ -233,7 +233,7 @@ def test_a_c_source_has_its_bounds(problem: str, small_run: vibench.Run, tmp_pat
     assert names == ["load", "force */", "both"]
     script = Exported(tmp_path / "model.npz")
     x, alpha, residuals = np.zeros(data["basis"].shape[1]), np.zeros(data["generators"].shape[1]), np.zeros(3)
-    lam, shift = (np.zeros(size) for size in data["certificate_responses"].shape)
+    lam, shift = (np.zeros(len(data[name])) for name in ("generators", "certificate_rows"))
     bounds, values, errors, plain = (np.zeros(3) for _ in range(4))
     for mu in model.parameters.sample(10, seed=5):
         exact = model.high_fidelity(mu)
@@ -289,8 +289,7 @@ def test_both_methods_of_the_correction_in_c_find_that_of_vibench(steps: int, tm
     parts = [
         "#include <float.h>\n#include <math.h>\n#include <string.h>\n"
         f"enum {{ LOADS = {size}, STEPS = {steps} }};\n"
-        "double certificate_inverse[LOADS * LOADS], certificate_responses[LOADS * LOADS];\n"
-        f"int certificate_rows[] = {{ {', '.join(map(str, range(size)))} }};\n",
+        "double certificate_inverse[LOADS * LOADS], certificate_compliance[LOADS * LOADS];\n",
         basic[basic.index("#define SUM(") : basic.index("/* Whether all numbers are finite")],
         text[text.index("static const double *inverse_row(") : text.index("/* out of M_kk")],
         text[text.index("/* out of M_kk") : text.index("/* A w with B w >= s")].replace("static", ""),
@@ -300,7 +299,7 @@ def test_both_methods_of_the_correction_in_c_find_that_of_vibench(steps: int, tm
     found.complement.argtypes = [ctypes.c_double, POINTER, POINTER, ctypes.POINTER(ctypes.c_int), POINTER]
     matrix, compliance = (
         np.ctypeslib.as_array((ctypes.c_double * size**2).in_dll(found, f"certificate_{name}")).reshape(size, size)
-        for name in ("inverse", "responses")
+        for name in ("inverse", "compliance")
     )
     for seed in range(80):
         rng = np.random.default_rng(seed)
