@@ -59,12 +59,6 @@ class ContactCode:
             terms = queried.contact_terms()
         return None if source is None or terms is None else cls(source, terms)
 
-    @property
-    def text(self) -> str:
-        """The code, after the tables that it needs."""
-        texts = [_table(f"contact_{name}", table) for name, table in self.source.tables.items()]
-        return "\n".join([*texts, self.source.text])
-
     def values(self, plain: int) -> dict[str, Any]:
         """Values of the template `reduced_model_contact`, where V_N has so many coordinates that no load touches."""
         terms, acting = self.terms, np.flatnonzero(self.terms.tested.any(axis=1))
@@ -78,9 +72,14 @@ class ContactCode:
         return {
             "contact_rows": len(terms.tested), "contact_entries": self.source.entries, "first_row": first,
             "acting": last - first, "first_unknown": terms.first, "reach": len(terms.reached),
-            "least_columns": max(plain, *lengths[0]), "contact_text": self.text,
+            "least_columns": max(plain, *lengths[0]), "contact_text": contact_text(self.source),
             "contact_tables": "\n".join(map(_array, arrays, arrays.values())),
         }  # fmt: skip
+
+
+def contact_text(source: ContactSource) -> str:
+    """The code of a constraint, after the tables that it needs."""
+    return "\n".join([*(_table(f"contact_{name}", table) for name, table in source.tables.items()), source.text])
 
 
 def _in_c(node: ast.expr, names: Sequence[str]) -> str:

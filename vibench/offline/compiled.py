@@ -11,21 +11,24 @@ import os
 import shlex
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from vibench.arrays import Array
-from vibench.errors import RequestError, UnsupportedError, foreign
+from vibench.errors import NumericalError, RequestError, UnsupportedError, foreign
 from vibench.files import scratch
-from vibench.interfaces.problem import MEMBERS, VariationalInequality
+from vibench.interfaces.contact_source import ContactSource
+from vibench.interfaces.problem import MEMBERS, Contact, VariationalInequality
 from vibench.interfaces.validation import training_parameters
 from vibench.model.chebyshev import AffinePolynomial
 from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel
 from vibench.offline import c_source
+from vibench.offline.c_source import contact_text
 from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, declared_model, member_polynomials
 from vibench.qp.exact import exact_solution
 from vibench.qp.verification import QPSolution
@@ -135,6 +138,26 @@ class CompiledProgram:
         if outcome > 1:
             return QPSolution(None, None, text)
         return QPSolution(x, alpha, f"{text} by the dual method" if steps.value < 0 else text, max(steps.value, 0))
+
+
+def compiled_contact(source: ContactSource, shape: tuple[int, int]) -> Callable[[Array], Contact | None]:
+    """`Problem.contact` by its C source, with B of this shape; an `UnsupportedError` if the compiler fails."""
+    wrapped = "int called(const double *mu, int *ends, int *columns, double *values, double *g)"
+    text = f"#include <math.h>\n{contact_text(source)}{wrapped} {{ return contact(mu, ends, columns, values, g); }}"
+    with foreign("the C compiler, or what it makes,"), scratch() as folder:
+        call = ctypes.CDLL(str(compiled(text, folder))).called
+    call.argtypes = [ctypes.c_void_p] * 5
+
+    def contact(mu: Array) -> Contact | None:
+        ends, columns = np.zeros(shape[0] + 1, np.intc), np.zeros(source.entries, np.intc)
+        at, values, g = np.ascontiguousarray(mu, float), np.zeros(source.entries), np.zeros(shape[0])
+        if not call(*(array.ctypes.data for array in (at, ends, columns, values, g))):
+            return None
+        if ends[-1] > source.entries:
+            raise NumericalError(f"the C source of the constraint fills {ends[-1]} entries, it says {source.entries}")
+        return Contact(sp.csr_array((values[: ends[-1]], columns[: ends[-1]], ends), shape), g)
+
+    return contact
 
 
 def compiler() -> list[str]:
