@@ -25,6 +25,7 @@ from .highfidelity.active_set import solve_high_fidelity as solve_high_fidelity
 from .interfaces.absent_rows import is_absent as is_absent
 from .interfaces.affine import AffineSum as AffineSum
 from .interfaces.affine_problem import AffineProblem as AffineProblem
+from .interfaces.contact_source import ContactSource as ContactSource
 from .interfaces.dual_sets import RAYS as RAYS
 from .interfaces.dual_sets import BlockKind as BlockKind
 from .interfaces.dual_sets import Blocks as Blocks

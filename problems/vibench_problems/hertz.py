@@ -15,6 +15,7 @@ from vibench import (
     Array,
     Contact,
     ContactLoads,
+    ContactSource,
     Indices,
     InnerProduct,
     Output,
@@ -231,6 +232,10 @@ class Hertz(Problem):
         smallest = self._pairing.end(ALL) / x[-1]
         reach = int(np.searchsorted(smallest * x, tested.end)) + 1
         return ContactLoads(fixed, varying, slaves, min(reach + 1, len(x)))
+
+    def contact_source(self) -> ContactSource:
+        """The same condition in C."""
+        return self._pairing.source(self._master_zone, self._contact_lift, self._approach or 0.0)
 
     def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
         """Refuse contact that reaches the last macro-edge: it may extend beyond the potential contact zone."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.resources import files
 from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
 
-from vibench import Array, Indices, NumericalError, SparseMatrix
+from vibench import Array, ContactSource, Indices, NumericalError, SparseMatrix
 
 ALL = slice(None)
 
@@ -76,6 +77,21 @@ class Pairing:
     def tested(self, eta: Array) -> Tested:
         """The same integrals for given multipliers η (m×k), and any master polygon."""
         return Tested(self, eta)
+
+    def source(self, master: Array, lift: Array, approach: float) -> ContactSource:
+        """The coupling to a master polygon (2×k) times mu[0], in C.
+
+        The gap closes by the approach, mu[1] if that is zero, times a displacement (s + k,) of both sides.
+        """
+        _, x, weights = self._points or (None, np.zeros(1), self._stretch)
+        macros, masters = len(self._height), master.shape[1]
+        tables = {
+            "x": master[0], "y": master[1], "lift": lift, "approach": approach, "macros": macros, "masters": masters,
+            "slave": self._slave[0], "height": self._height, "on_slave": self._on_slave.data, "abscissae": x,
+            "weights": weights, "points": 0 if self._points is None else len(x) // (2 * macros),
+        }  # fmt: skip
+        text = (files("vibench_problems") / "mortar.c").read_text(encoding="utf-8")
+        return ContactSource(text, tables, 5 * macros + masters)
 
     def on_slave(self, eta: Array) -> tuple[Array, Array]:
         """−∫ v η (s×k) for nodal values of v on the slave side, and ∫ y η (k,) there."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.resources import files
 from typing import ClassVar
 
 import numpy as np
@@ -14,6 +15,7 @@ from vibench import (
     Array,
     Contact,
     ContactLoads,
+    ContactSource,
     Indices,
     InnerProduct,
     MeshFields,
@@ -228,6 +230,18 @@ class TwoBodies(ContactZone):
             return loads, gaps + mu[0] * (self._height @ loads) - mu[1] * areas
 
         return ContactLoads(fixed, varying, slaves)
+
+    def contact_source(self) -> ContactSource:
+        """The same condition in C."""
+        below, above, fixed = self.slave.shape.ticks, self.master.shape.ticks, self._on_slave
+        cells, hats = len(below) - 1, 2 * len(below) + len(above)
+        tables = {
+            "below": below, "above": above, "cells": cells, "nodes": len(above), "covered": COVERED_RTOL, "hats": hats,
+            "gap": self._slave_gap, "areas": self.areas, "height": self._height, "slaves": len(self.slave.contact),
+            "slave_ends": fixed.indptr, "slave_columns": fixed.indices, "slave_values": fixed.data,
+        }  # fmt: skip
+        text = (files("vibench_problems") / "two_bodies.c").read_text(encoding="utf-8")
+        return ContactSource(text, tables, fixed.nnz + hats**2)
 
     def _pairs(self, mu: Array) -> Array:
         """Integrals over the cells below of the hat functions above, along one axis (k×(k + 1))."""

@@ -97,8 +97,8 @@ def in_c(file: Path, exported: Mapping[str, np.ndarray]) -> dict[str, Call]:
     subprocess.run(compiler, check=True)
     found = ctypes.CDLL(str(library))
     sizes = data["f_terms"].shape[1], data["g_terms"].shape[1], 3
-    if "certificate_responses" in exported:
-        sizes += (*exported["certificate_responses"].shape, 3)
+    if "certificate_rows" in exported:
+        sizes += (len(exported["generators"]), len(exported["certificate_rows"]), 3)
     arrays = [np.zeros(size) for size in sizes]
     x, alpha, residuals, *others = [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
 

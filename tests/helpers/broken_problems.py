@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from fake_plugins import Wire
 
 import vibench
-from vibench import Array, Contact, InnerProduct, MeshFields, Output, Picture, VariationalInequality
+from vibench import Array, Contact, ContactSource, InnerProduct, MeshFields, Output, Picture, VariationalInequality
 
 
 class Declared(Wire):
@@ -115,6 +115,30 @@ LoadsWrong = _variant("LoadsWrong", Declared, contact_loads=lambda self, eta: De
 LoadsReachFarther = _variant(
     "LoadsReachFarther", Declared, contact_loads=lambda self, eta: replace(Declared.contact_loads(self, eta), reach=1)
 )
+# The C code of its constraint lacks a part of g.
+SourceWrong = _variant(
+    "SourceWrong",
+    Declared,
+    contact_source=lambda self: ContactSource(
+        """static int contact(const double *mu, int *ends, int *columns, double *values, double *g)
+        {
+            (void)mu;
+            for (int i = 0; i < contact_rows; i++) {
+                for (ends[i + 1] = ends[i]; ends[i + 1] < contact_last[i]; ends[i + 1]++) {
+                    columns[ends[i + 1]] = contact_columns[ends[i + 1]];
+                    values[ends[i + 1]] = contact_values[ends[i + 1]];
+                }
+                g[i] = 0.999 * contact_g;
+            }
+            return 1;
+        }""",
+        {
+            "rows": self.W.dim, "last": self.mass.indptr[1:], "columns": self.mass.indices, "values": -self.mass.data,
+            "g": self.depth * self.step,
+        },
+        self.mass.nnz,
+    ),
+)  # fmt: skip
 NoInequality = _variant(
     "NoInequality", assemble=lambda self, mu: tuple(getattr(Wire.assemble(self, mu), name) for name in "AfBg")
 )

@@ -377,9 +377,11 @@ def _export_model(run: str, cell: str, out: Path, tolerance: float | None, bases
         terms = f"{len(member.terms)} term{'s' * (len(member.terms) > 1)}"
         form = f"{terms}, polynomials of degree ({', '.join(map(str, member.degrees))})"
         echo(f"{name}: {form if any(member.degrees) else 'constant'}, relative error {member.error:.1e}")
+    if made.code is not None:
+        echo("B, g: the code of the problem in C")
     echo("relative errors are those at random parameters and at the corners of the box")
     # The script has fewer solvers than vibench.
-    if made.about["solver"] != model.solver and file.suffix == ".npz":
+    if made.code is None and made.about["solver"] != model.solver and file.suffix == ".npz":
         echo(f"the cell's solver is {model.solver}, the script solves by {made.about['solver']}")
     why = made.about["no_bounds"]
     echo(f"no error bounds: {why}" if why else f"error bounds in C: {made.about['certificate']}")
@@ -390,6 +392,10 @@ def _export_model(run: str, cell: str, out: Path, tolerance: float | None, bases
     if file.suffix == ".fmu":
         echo(f"{file}: FMI 2.0, co-simulation, with its C source and its program for this platform")
         return
+    sources = [file.with_suffix(end) for end in (".c", ".h") if out.suffix == ".c"]
+    if made.code is not None:
+        echo(f"{', '.join(map(str, [file, *sources]))}: the program, and the bases of its answers")
+        return
     # The script and the high-fidelity model take turns, so that a change of the machine's pace concerns both.
     mus = model.parameters.sample(5, seed=0)
     calls: list[Callable[..., Any]] = [reduced_model.Model(file).solve, model.high_fidelity]
@@ -397,7 +403,6 @@ def _export_model(run: str, cell: str, out: Path, tolerance: float | None, bases
     # The first query of both is longer than the others, as caches are cold.
     query, solution = (f"{1e3 * median(column):.2g} ms" for column in zip(*seconds[1:], strict=True))
     echo(f"a query takes {query}; the high-fidelity solution {solution}")
-    sources = [file.with_suffix(end) for end in (".c", ".h") if out.suffix == ".c"]
     written = ", ".join(map(str, [file, file.with_name("reduced_model.py"), *sources]))
     echo(f"{written}: `from reduced_model import Model`, then `Model({str(file)!r}).solve(mu)`")
 

@@ -17,6 +17,7 @@ from vibench.arrays import Array, Indices, Mask, SparseMatrix, real_matrix, real
 from vibench.errors import at_parameter
 from vibench.interfaces.absent_rows import settled_bounds, without_infinities
 from vibench.interfaces.affine import AffineSum
+from vibench.interfaces.contact_source import ContactSource
 from vibench.interfaces.dual_sets import RAYS, DualSet
 from vibench.interfaces.outputs import MeshFields, Output, Picture
 from vibench.interfaces.parameters import ParameterBox
@@ -194,6 +195,10 @@ class Problem(ABC):
 
     def contact(self, mu: Array) -> Contact | None:  # noqa: ARG002
         """The constraint at mu (d,) on `contact_dofs`, assembled at that cost alone; `None` if not implemented."""
+        return None
+
+    def contact_source(self) -> ContactSource | None:
+        """`contact` in C, for exported programs; `None` if not implemented."""
         return None
 
     @property

@@ -28,10 +28,17 @@ from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.chebyshev import AffinePolynomial
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline import c_source
-from vibench.offline.c_source import ExactMember
+from vibench.offline.c_source import ContactCode, ExactMember
 from vibench.offline.compiled import first_sets
 from vibench.offline.models import Model
-from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, InaccurateError, declared_terms, member_polynomials
+from vibench.offline.polynomials import (
+    EVALUATIONS,
+    TOLERANCE,
+    InaccurateError,
+    declared_model,
+    declared_terms,
+    member_polynomials,
+)
 from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS
 from vibench.signatures import AtLeastOne, Share, bordered
@@ -51,6 +58,8 @@ class ExportedModel:
     thetas: Mapping[str, AffinePolynomial]
     # Members and θ of a C source whose coefficients are declared as expressions.
     exact: Mapping[str, ExactMember]
+    # In place of polynomials of B and g the C code of the problem, which a file for the script cannot hold.
+    code: ContactCode | None = None
 
     @property
     def error(self) -> float:
@@ -106,12 +115,12 @@ def export_model(
         raise RequestError(f"'{script}' exists and is not the runtime of this version; choose another folder")
     found = exported(model, tolerance, evaluations, bases and not is_fmu, c or is_fmu)
     given = found.arrays, found.about, file.stem
-    texts = list(c_source.source(found.members, *given, found.thetas, found.exact) if c or is_fmu else ())
+    texts = list(c_source.source(found.members, *given, found.thetas, found.exact, found.code) if c or is_fmu else ())
     if is_fmu:
         # The modes stand in the order of the numbers that the certificate in C takes.
         contents = {file: fmu(texts[0], *given, [*CorrectionMode].index(model.correction))}
     else:
-        contents = {file: _npz(found), script: runtime}
+        contents = {file: _npz(found)} | ({script: runtime} if found.code is None else {})
         contents |= {path: text.encode() for path, text in zip(sources, texts, strict=True)}
     # All contents are computed before the first is written: a failure leaves no file.
     with writing(file):
@@ -126,22 +135,25 @@ def exported(
 ) -> ExportedModel:
     """The model as `export_model` writes it."""
     box = model.parameters
-    why = _reason_for_none(model.certificate)
+    queried = declared_model(model.reduced, coded=c)
+    code = ContactCode.of(queried) if c else None
+    coded = "" if code is None else "Bg"
+    why = _reason_for_none(model.certificate, code)
     if not why and not c:
         why = "only C programs have them; export to a name that ends in .c"
     certificate = None if why else model.certificate
-    beside = None if certificate is None else partial(_certificate_thetas, certificate)
+    beside = None if certificate is None else partial(_certificate_thetas, certificate, coded)
     # The matrix from the θ of A as a query evaluates them to those of the certificate; none of a constant A.
     rotation = None if certificate is None else _stiffness_coefficients(certificate)
     rotated, limits = {} if rotation is None else {"theta_A": rotation}, (tolerance, evaluations)
     try:
-        queried, polynomials = member_polynomials(model.reduced, *limits, fixed=c, beside=beside, rotated=rotated)
+        polynomials = member_polynomials(queried, *limits, beside=beside, rotated=rotated, left_out=coded)
     except InaccurateError as error:
         raise RequestError(
             f"{error}; `--tolerance {1.05 * error.error:.1e}` exports this approximation; more evaluations than "
             f"{evaluations}, an argument of `vibench.export_model`, may reach a better one"
         ) from None
-    members = {name: polynomials.pop(name) for name in MEMBERS}
+    members = {name: polynomials.pop(name) for name in MEMBERS if name not in coded}
     about = _about(model, members) | {"certificate": Guarantee.NONE.value, "no_bounds": why}
     arrays = {"lower": box.lower, "upper": box.upper}
     if isinstance(queried, HyperReducedModel) and queried.space is not None:
@@ -154,7 +166,7 @@ def exported(
     declared = {name: queried.problem.affine[name] for name in declared_terms(queried)} if c else {}
     sums = {name: ExactMember.from_sum(declared[name], members[name].terms) for name in declared}
     exact = {name: member for name, member in sums.items() if member is not None}
-    arrays |= first_sets(queried.problem, members) if c else {}
+    arrays |= first_sets(queried, members) if c else {}
     if certificate is not None:
         terms = {name: np.eye(len(member.thetas)) for name, member in exact.items()}
         if rotation is not None and "A" in terms:
@@ -162,8 +174,8 @@ def exported(
         exact |= {f"theta_{name}": ExactMember(exact[name].thetas, matrix) for name, matrix in terms.items()}
         unknowns = contact_unknowns(model.problem) if bases else None
         arrays |= _certificate_arrays(certificate, polynomials | members, exact, unknowns)
-        about["certificate"] = guarantee(certificate, {*model.problem.constant, *exact}).value
-    return ExportedModel(members, arrays, about, polynomials, exact)
+        about["certificate"] = guarantee(certificate, {*model.problem.constant, *exact, *coded}).value
+    return ExportedModel(members, arrays, about, polynomials, exact, code)
 
 
 def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, Any]:
@@ -218,7 +230,9 @@ def _licence(distribution: str) -> str:
 
 
 def _npz(model: ExportedModel) -> bytes:
-    arrays: dict[str, Any] = {"format": np.array(FORMAT), "about": np.array(json.dumps(dict(model.about)))}
+    # The script refuses bases without members.
+    kind = FORMAT if model.code is None else "vibench bases 1"
+    arrays: dict[str, Any] = {"format": np.array(kind), "about": np.array(json.dumps(dict(model.about)))}
     # the script bounds no errors, and of a certificate only the C source needs more than its `lift`
     left_out = {n for n in model.arrays if n.startswith(("certificate_", "start_")) and n != "certificate_lift"}
     arrays |= {name: array for name, array in model.arrays.items() if name not in left_out}
@@ -230,24 +244,26 @@ def _npz(model: ExportedModel) -> bytes:
     return content.getvalue()
 
 
-def _reason_for_none(certificate: OnlineCertificate | None) -> str:
+def _reason_for_none(certificate: OnlineCertificate | None, code: ContactCode | None) -> str:
     """Reason why an exported model cannot bound its errors; "" if it can."""
     if certificate is None:
         return "its cell has no bounds: they need bounds = true"
-    if certificate.prepared is None or certificate.base.bound_terms is None:
+    if certificate.prepared is None or (certificate.base.bound_terms is None and code is None):
         return (
-            "they need B(mu) and g(mu) on all contact unknowns, which the code of the problem evaluates unless B is "
-            "declared to be one matrix times a function of mu and g an affine sum"
+            "they need B(mu) and g(mu) on all contact unknowns: by `contact_source` of the problem, or B declared to "
+            "be one matrix times a function of mu and g an affine sum"
         )
     return ""
 
 
-def _certificate_thetas(certificate: OnlineCertificate, samples: Mapping[str, Array]) -> dict[str, Array]:
+def _certificate_thetas(
+    certificate: OnlineCertificate, left_out: str, samples: Mapping[str, Array]
+) -> dict[str, Array]:
     """Coefficients θ (Q,) of A, f, B and g in the terms of the certificate, from those that a query evaluates."""
     found = certificate.base.coefficients(samples) | {"g": samples.get("g", np.ones(1))}
     if (matrix := _stiffness_coefficients(certificate)) is not None:
         found["A"] = matrix @ samples["A"]
-    return {f"theta_{name}": value for name, value in found.items()}
+    return {f"theta_{name}": value for name, value in found.items() if name not in left_out}
 
 
 def _stiffness_coefficients(certificate: OnlineCertificate) -> Array | None:
@@ -268,14 +284,12 @@ def _certificate_arrays(
     # With the positions of the contact `unknowns`, those that take ν to a corrected u at mesh size are among them.
     # Bounds grow by what the measured errors of the polynomials, of A and of all θ, may add.
     base, residual, corrections = certificate.base, certificate.residual, certificate.prepared
-    terms = base.bound_terms
-    assert corrections is not None and terms is not None  # noqa: PT018  there is no reason for none
-    responses = np.zeros((len(corrections.basis), len(corrections.rows)))
-    responses[corrections.moved] = corrections.responses
+    assert corrections is not None  # there is no reason for none
     found = {
-        "generators": certificate.generators, "bounds": terms, "rows": corrections.rows, "inverse": corrections.inverse,
-        "diagonal": corrections.compliance.diagonal(), "reach": corrections.reach, "basis": corrections.basis,
-        "responses": responses, "sizes": corrections.sizes, "directions": corrections.directions,
+        "generators": certificate.generators, "rows": corrections.rows, "inverse": corrections.inverse,
+        "compliance": corrections.compliance, "reach": corrections.reach, "basis": corrections.basis,
+        "responses": corrections.responses, "moved": corrections.moved, "sizes": corrections.sizes,
+        "directions": corrections.directions,
         "terms": np.array(corrections.terms), "kept": residual.kept, "factor": residual.factor,
         "inverse_scale": residual.inverse_scale, "remainder": np.array(residual.remainder), "norms": residual.norms,
         "round_off": np.array(residual.round_off), "margins": np.array([certificate.margin, corrections.error]),
@@ -301,9 +315,17 @@ def _certificate_arrays(
             np.sqrt(2.0) * error["A"]
             + np.abs(polynomials[of_A].coefficients).sum(axis=0) @ certificate.energy_round_off
         ),
-        "constraint_error": np.array(error["theta_B"]), "multiplier_norms": of_lam,
-        "bound_errors": error["theta_g"] * np.linalg.norm(terms, axis=1),
     }  # fmt: skip
+    if (terms := base.bound_terms) is not None:
+        found |= {
+            "bounds": terms, "bound_errors": error["theta_g"] * np.linalg.norm(terms, axis=1),
+            "constraint_error": np.array(error["theta_B"]), "multiplier_norms": of_lam,
+        }  # fmt: skip
+    else:
+        assert certificate.forces is not None
+        bodies, (ends, columns, values) = base.inf_sup.entries
+        found |= {"forces": certificate.forces, "bodies": bodies.astype(int)}
+        found |= {"known_ends": ends, "known_columns": columns, "known_values": values}
     if (spectral := base.spectral) is not None:
         grid = spectral.grid
         found |= {

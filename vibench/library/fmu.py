@@ -30,7 +30,7 @@ def fmu(source: str, arrays: Mapping[str, Array], about: Mapping[str, Any], stem
     inputs = zip(box["names"], box["units"], *numbers, strict=True)
     variables = [dict(zip(("name", "unit", "start", "min", "max"), each, strict=True)) for each in inputs]
     variables += outputs
-    if certified := "certificate_responses" in arrays:
+    if certified := "certificate_rows" in arrays:
         variables += [{**one, "name": f"bound:{one['name']}"} for one in outputs]
         variables += [{"name": f"bound_{of}"} for of in ("u_energy", "lambda_natural", "u_relative")]
     elif corrected:
@@ -40,7 +40,7 @@ def fmu(source: str, arrays: Mapping[str, Array], about: Mapping[str, Any], stem
         raise RequestError(f"two variables of the FMU would have the name '{twice}'; rename a parameter or an output")
     # The same model has the same identifier, and is the same file.
     guid = hashlib.sha256(f"{source}{variables}{corrected}".encode()).hexdigest()[:32]
-    rows, loads = arrays["certificate_responses"].shape if certified else (1, 1)
+    rows, loads = (len(arrays[f"certificate_{of}"]) if certified else 1 for of in ("generators", "rows"))
     source += c_source.filled("fmu.c", {
         "name": name, "guid": guid, "start": ", ".join(map(repr, start.tolist())), "rows": rows, "loads": loads,
         "certified": int(certified), "corrected": corrected, "output_count": len(outputs), "values": len(variables),

@@ -98,6 +98,21 @@ class ReducedOperators:
     factor: Array | None
 
 
+@dataclass(frozen=True)
+class ContactTerms:
+    """B and g on Φ from Bᵀη on some contact unknowns and ηᵀg, for multipliers η that give χ = η C."""
+
+    # η (m×t), and C (t×R), or `None` where χ are the last columns of η; all others are those of the enrichment.
+    tested: Array
+    combination: Array | None
+    # R.
+    generators: int
+    # ηᵀB Φ is `fixed` (t×d) and the transpose of the rows of Bᵀη from `first` on times `reached` (j×d).
+    first: int
+    fixed: Array
+    reached: Array
+
+
 def reason_for_full_assembly(model: ReducedModel, members: Mapping[str, AffineMember]) -> str:
     """Reason why the model has to be assembled in full, as in the paper; "" if it can be hyper-reduced."""
     if model.enrichment.supply is not None:
@@ -233,6 +248,22 @@ class HyperReducedModel:
     def declared_terms(self) -> dict[str, Array]:
         """Flat terms (Q×size) of the members declared affine, of A packed upper triangles, on Φ."""
         return {name: getattr(self._operators, name).terms for name in self._operators.affine}
+
+    def contact_terms(self) -> ContactTerms | None:
+        """What B and g on Φ are made of where both are evaluated on the contact unknowns; `None` elsewhere."""
+        if self._operators.B is not None or self._operators.g is not None:
+            return None
+        (tested, combination), loads = self._tested, self._loads
+        assert loads is not None  # where there is no B
+        if isinstance(self.space, LoadCoordinates):
+            fixed, reached = self.space.terms
+        else:
+            assert self._operators.contact_basis is not None  # of a fixed space
+            basis = self._operators.contact_basis
+            fixed, reached = loads.fixed.T @ basis, basis[loads.reached]
+        # What is fixed of the loads that vary is evaluated with these.
+        fixed = fixed - loads.fixed[loads.reached].T @ reached
+        return ContactTerms(tested, combination, self.generators.shape[1], loads.first, fixed, reached)
 
     def members(self, mu: Array, samples: Samples) -> VariationalInequality:
         """Members at mu (d,) on Φ, a space that does not depend on mu; B on (η, χ) where Φ has `space`.

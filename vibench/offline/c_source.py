@@ -17,8 +17,10 @@ import numpy as np
 from vibench.arrays import Array, Indices, Mask
 from vibench.errors import RequestError
 from vibench.interfaces.affine import CONSTANTS, AffineSum, Expression, Thetas
+from vibench.interfaces.contact_source import ContactSource
 from vibench.interfaces.problem import MEMBERS
 from vibench.model.chebyshev import AffinePolynomial
+from vibench.model.hyperreduced import AnyReducedModel, ContactTerms, HyperReducedModel
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,44 @@ class ExactMember:
             else:
                 texts.append(repr(float(theta)))
         return cls(tuple(texts), terms)
+
+
+@dataclass(frozen=True)
+class ContactCode:
+    """The code of a problem that evaluates B and g in C, and what makes the reduced ones of its answers."""
+
+    source: ContactSource
+    terms: ContactTerms
+
+    @classmethod
+    def of(cls, queried: AnyReducedModel) -> ContactCode | None:
+        """That of a model whose B and g are evaluated on the contact unknowns; `None` where there is none."""
+        source, terms = queried.problem.contact_source(), None
+        if source is not None and isinstance(queried, HyperReducedModel):
+            terms = queried.contact_terms()
+        return None if source is None or terms is None else cls(source, terms)
+
+    def values(self, plain: int) -> dict[str, Any]:
+        """Values of the template `reduced_model_contact`, where V_N has so many coordinates that no load touches."""
+        terms, acting = self.terms, np.flatnonzero(self.terms.tested.any(axis=1))
+        first, last = (int(acting[0]), int(acting[-1]) + 1) if len(acting) else (0, 1)
+        columns = np.arange(1, terms.fixed.shape[1] + 1)
+        lengths = [np.max((part != 0.0) * columns, axis=1, initial=0) for part in (terms.fixed, terms.reached)]
+        arrays = {
+            "reduced_eta": terms.tested[first:last], "reduced_fixed": terms.fixed, "reduced_reached": terms.reached,
+            "reduced_lengths": lengths[1],
+        }  # fmt: skip
+        return {
+            "contact_rows": len(terms.tested), "contact_entries": self.source.entries, "first_row": first,
+            "acting": last - first, "first_unknown": terms.first, "reach": len(terms.reached),
+            "least_columns": max(plain, *lengths[0]), "contact_text": contact_text(self.source),
+            "contact_tables": "\n".join(map(_array, arrays, arrays.values())),
+        }  # fmt: skip
+
+
+def contact_text(source: ContactSource) -> str:
+    """The code of a constraint, after the tables that it needs."""
+    return "\n".join([*(_table(f"contact_{name}", table) for name, table in source.tables.items()), source.text])
 
 
 def _in_c(node: ast.expr, names: Sequence[str]) -> str:
@@ -68,33 +108,46 @@ def _in_c(node: ast.expr, names: Sequence[str]) -> str:
 def source(
     members: Mapping[str, AffinePolynomial], arrays: Mapping[str, Array], about: Mapping[str, Any], stem: str,
     thetas: Mapping[str, AffinePolynomial] = MappingProxyType({}),
-    exact: Mapping[str, ExactMember] = MappingProxyType({}),
+    exact: Mapping[str, ExactMember] = MappingProxyType({}), code: ContactCode | None = None,
 ) -> tuple[str, str]:  # fmt: skip
-    """The C source of a model whose basis does not depend on the parameter, and its header."""
+    """The C source of a model, and its header."""
     # The names of its functions begin with `stem`. With the `thetas` of a certificate it has error bounds. Members that
-    # are `exact` take the place of polynomials with their names.
+    # are `exact` take the place of polynomials with their names; B and g may be those of `code`.
     name = identifier(stem)
     box, cell, polynomials = about["parameters"], about["cell"], {**members, **thetas}
     own = {key: exact.get(key, polynomial) for key, polynomial in polynomials.items()}
     parameters, sets, factor = (arrays.get(f"start_{name}", np.zeros(0)) for name in ("parameters", "sets", "factor"))
+    space = members["f"].terms.shape[1]
+    tested = members["B"].terms.shape[1] // space if code is None else code.terms.tested.shape[1]
+    constraints = members["g"].terms.shape[1] if code is None else code.terms.generators
+    combination = None if code is None else code.terms.combination
+    # The basis of a model that is enriched at every parameter begins with that of V_N.
+    plain = arrays["plain"].shape[1] if "plain" in arrays else space
+    supremizers = 0 if plain == space else tested - (constraints if combination is None else 0)
     values = {
         "name": name, "macro": name.upper(),
         "origin": _comment(", ".join(str(cell[key]) for key in ("problem", "dual", "primal", "cell") if key in cell)),
         "licence": _comment(", ".join(filter(None, about["source"].values()))),
         "exporter": _comment(about["exported_by"]),
         "parameters": _comment(", ".join(f"{n} [{u}]" for n, u in zip(box["names"], box["units"], strict=True))),
-        "dimension": len(arrays["lower"]), "unknowns": members["f"].terms.shape[1],
-        "constraints": members["g"].terms.shape[1],
+        "dimension": len(arrays["lower"]), "unknowns": plain + supremizers, "space": space, "plain": plain,
+        "tested": tested, "constraints": constraints, "combined": int(combination is not None),
+        "combination": _array("reduced_combination", np.zeros(0) if combination is None else combination),
         "degree": max((max(one.degrees) for one in own.values() if isinstance(one, AffinePolynomial)), default=0),
         "terms": max(-(-len(member.terms) // 4) * 4 for member in own.values()),
         "accuracy": repr(float(about["accuracy"])), "factorised": int(factor.size > 0), "factor": _numbers(factor),
         "lower": _numbers(arrays["lower"]), "upper": _numbers(arrays["upper"]),
-        "members": "\n".join(_member(key, own[key]) for key in MEMBERS), "starts": len(parameters),
+        "members": "\n".join(_member(key, own[key]) for key in MEMBERS if key in own), "starts": len(parameters),
         "start_parameters": _numbers(parameters), "start_sets": _numbers(sets, "char"),
     }  # fmt: skip
     # A function that nothing calls would be a warning of the compiler.
     some = any(isinstance(one, AffinePolynomial) for one in own.values())
     values["products"] = filled("reduced_model_products.c", {}) if some else ""
+    if code is not None:
+        values |= code.values(plain)
+    of_constraint, of_space = "members" if code is None else "contact", "enriched" if supremizers else "fixed"
+    values["constraint"] = filled(f"reduced_model_{of_constraint}.c", values)
+    values["assembly"] = filled(f"reduced_model_{of_space}.c", values)
     parts: list[str] = []
     values["output_count"] = len(arrays.get("outputs_x", ()))
     if "outputs_x" in arrays:
@@ -104,9 +157,13 @@ def source(
         parts.append("outputs")
     if thetas:
         values |= _certified({key: own[key] for key in thetas}, arrays) | {"guarantee": about["certificate"]}
+        kind, contacts = "scaled" if code is None else "on_contact", len(arrays["certificate_basis"])
+        values["certified_constraint"] = filled(f"reduced_model_{kind}.c", {"contacts": contacts})
+        values["scaled"] = int(code is None)
         parts += ["certificate", "certified_outputs"] if parts else ["certificate"]
     for kind, name in (("h", "declarations"), ("c", "code")):
         values[name] = "".join(filled(f"reduced_model_{part}.{kind}", values) for part in parts)
+    values["evaluated"] = "" if code is None else "; the code\n * of the problem evaluates B and g"
     header = filled("reduced_model.h", values)
     return filled("reduced_model.c", values | {"header": header}), header
 
@@ -132,14 +189,15 @@ def _certified(thetas: Mapping[str, AffinePolynomial | ExactMember], arrays: Map
     own: dict[str, Array] = {f"certificate_{name}": np.zeros(1) for name in spectral}
     own |= {name: array for name, array in arrays.items() if name.startswith("certificate_")}
     own.pop("certificate_lift", None)
-    (rows, loads), (directions, kept) = own["certificate_responses"].shape, own["certificate_factor"].shape
+    rows, (moved, loads) = len(own["certificate_generators"]), own["certificate_responses"].shape
+    directions, kept = own["certificate_factor"].shape
     norms = own["certificate_norms"].size
     # Doubles on the stack of the certificate, for its documentation in the header.
     numbers = loads * (loads + 1) // 2 + 8 * rows + 20 * loads + norms + kept
-    sizes = {name: polynomial.terms.shape[1] for name, polynomial in thetas.items()}
+    sizes = {"theta_B": 1, "theta_g": 1} | {name: polynomial.terms.shape[1] for name, polynomial in thetas.items()}
     declared = len(arrays.get("certificate_term_errors", ()))
     return sizes | {
-        "rows": rows, "loads": loads, "directions": directions, "kept": kept, "residual_terms": norms,
+        "rows": rows, "loads": loads, "moved": moved, "directions": directions, "kept": kept, "residual_terms": norms,
         "spectral": int("certificate_anchors" in arrays), "stack": round(8e-3 * numbers) + 1,
         "ranges": len(arrays.get("certificate_ranges", ())), "leading": len(own["certificate_turn"]),
         "declared": declared, "stiffness_terms": sizes["theta_A"] - declared,
@@ -147,6 +205,13 @@ def _certified(thetas: Mapping[str, AffinePolynomial | ExactMember], arrays: Map
         "thetas": "\n".join(_member(key, polynomial) for key, polynomial in thetas.items()),
         "arrays": "\n".join(map(_array, own, own.values())),
     }  # fmt: skip
+
+
+def _table(name: str, table: Array | Indices | float) -> str:
+    """The definition of an array, or of a number, in C."""
+    if np.ndim(table):
+        return _array(name, np.asarray(table))
+    return f"enum {{ {name} = {table} }};" if isinstance(table, int) else f"static const double {name} = {table!r};"
 
 
 def _array(name: str, array: Array | Indices, kind: str = "") -> str:

@@ -11,22 +11,25 @@ import os
 import shlex
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from vibench.arrays import Array
-from vibench.errors import RequestError, UnsupportedError, foreign
+from vibench.errors import NumericalError, RequestError, UnsupportedError, foreign
 from vibench.files import scratch
-from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
+from vibench.interfaces.contact_source import ContactSource
+from vibench.interfaces.problem import MEMBERS, Contact, VariationalInequality
 from vibench.interfaces.validation import training_parameters
 from vibench.model.chebyshev import AffinePolynomial
-from vibench.model.hyperreduced import AnyReducedModel
+from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel
 from vibench.offline import c_source
-from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, member_polynomials
+from vibench.offline.c_source import contact_text
+from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, declared_model, member_polynomials
 from vibench.qp.exact import exact_solution
 from vibench.qp.verification import QPSolution
 from vibench.text import one_line
@@ -48,12 +51,15 @@ class CompiledModel:
         Raises an `UnsupportedError` if the basis depends on the parameter, or polynomials are inaccurate or too large.
         """
         try:
-            _, polynomials = member_polynomials(reduced, TOLERANCE, EVALUATIONS, fixed=True, check=_refuse_large)
+            queried = declared_model(reduced)
+            if isinstance(queried, HyperReducedModel) and queried.space is not None:
+                raise RequestError("the enrichment changes the basis at every parameter")
+            polynomials = member_polynomials(queried, TOLERANCE, EVALUATIONS, check=_refuse_large)
         except RequestError as error:
             raise UnsupportedError(f"the model cannot be exported to C: {error}") from None
         box, members = reduced.problem.parameters, {name: polynomials[name] for name in MEMBERS}
         # Store polynomials and not the source: who loads an artefact runs nothing that is in it.
-        arrays = {"lower": box.lower, "upper": box.upper, **first_sets(reduced.problem, members)}
+        arrays = {"lower": box.lower, "upper": box.upper, **first_sets(reduced, members)}
         return cls(members, arrays, accuracy)
 
     @property
@@ -71,23 +77,30 @@ class CompiledModel:
         return CompiledProgram(self.source, *(self.members[name].terms.shape[1] for name in "fg"))
 
 
-def first_sets(problem: Problem, members: Mapping[str, AffinePolynomial]) -> dict[str, Array]:
+def first_sets(reduced: AnyReducedModel, members: Mapping[str, AffinePolynomial]) -> dict[str, Array]:
     """Training parameters (P×d), active sets (P×R) of their programs, and the factor of a constant A, packed."""
-    box, training = problem.parameters, training_parameters(problem)
+    box, training = reduced.problem.parameters, training_parameters(reduced.problem)
     # A query begins with the set of the nearest parameter, for which it looks at all of them.
     training = training[:: -(-len(training) // 512)]
-    values = [members[name].evaluate((training - box.lower) / (box.upper - box.lower)) for name in MEMBERS]
-    sets, size = np.zeros(values[3].shape, bool), values[1].shape[1]
-    for k, (packed, f, B, g) in enumerate(zip(*values, strict=True)):
-        A = np.zeros((size, size))
-        A[np.triu_indices(size)] = packed
-        A += np.triu(A, 1).T
-        if (solved := exact_solution(VariationalInequality(A, f, B.reshape(-1, size), g))) is not None:
+    if set(MEMBERS) <= members.keys() and not (isinstance(reduced, HyperReducedModel) and reduced.space is not None):
+        values = [members[name].evaluate((training - box.lower) / (box.upper - box.lower)) for name in MEMBERS]
+        programs = (_unpacked(*each) for each in zip(*values, strict=True))
+    else:
+        programs = (reduced.assemble(mu).program for mu in training)
+    sets = np.zeros((len(training), reduced.generators.shape[1]), bool)
+    for k, program in enumerate(programs):
+        if (solved := exact_solution(program)) is not None:
             sets[k] = solved.alpha > 0.0
     found = {"start_parameters": training, "start_sets": sets}
-    if "A" in problem.constant:
-        found["start_factor"] = np.linalg.cholesky(A).T[np.triu_indices(size)]
+    if "A" in reduced.problem.constant and len(program.f) == members["f"].terms.shape[1]:
+        found["start_factor"] = np.linalg.cholesky(program.A).T[np.triu_indices(len(program.f))]
     return found
+
+
+def _unpacked(packed: Array, f: Array, B: Array, g: Array) -> VariationalInequality:
+    A = np.zeros((len(f), len(f)))
+    A[np.triu_indices(len(f))] = packed
+    return VariationalInequality(A + np.triu(A, 1).T, f, B.reshape(-1, len(f)), g)
 
 
 def _refuse_large(program: VariationalInequality) -> None:
@@ -125,6 +138,26 @@ class CompiledProgram:
         if outcome > 1:
             return QPSolution(None, None, text)
         return QPSolution(x, alpha, f"{text} by the dual method" if steps.value < 0 else text, max(steps.value, 0))
+
+
+def compiled_contact(source: ContactSource, shape: tuple[int, int]) -> Callable[[Array], Contact | None]:
+    """`Problem.contact` by its C source, with B of this shape; an `UnsupportedError` if the compiler fails."""
+    wrapped = "int called(const double *mu, int *ends, int *columns, double *values, double *g)"
+    text = f"#include <math.h>\n{contact_text(source)}{wrapped} {{ return contact(mu, ends, columns, values, g); }}"
+    with foreign("the C compiler, or what it makes,"), scratch() as folder:
+        call = ctypes.CDLL(str(compiled(text, folder))).called
+    call.argtypes = [ctypes.c_void_p] * 5
+
+    def contact(mu: Array) -> Contact | None:
+        ends, columns = np.zeros(shape[0] + 1, np.intc), np.zeros(source.entries, np.intc)
+        at, values, g = np.ascontiguousarray(mu, float), np.zeros(source.entries), np.zeros(shape[0])
+        if not call(*(array.ctypes.data for array in (at, ends, columns, values, g))):
+            return None
+        if ends[-1] > source.entries:
+            raise NumericalError(f"the C source of the constraint fills {ends[-1]} entries, it says {source.entries}")
+        return Contact(sp.csr_array((values[: ends[-1]], columns[: ends[-1]], ends), shape), g)
+
+    return contact
 
 
 def compiler() -> list[str]:

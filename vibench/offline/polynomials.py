@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -33,19 +33,16 @@ class InaccurateError(RequestError):
 
 
 def member_polynomials(
-    reduced: AnyReducedModel, tolerance: float, evaluations: int, *, fixed: bool, beside: Beside | None = None,
+    queried: AnyReducedModel, tolerance: float, evaluations: int, *, beside: Beside | None = None,
     rotated: Mapping[str, Array] = {}, check: Callable[[VariationalInequality], None] | None = None,
-) -> tuple[AnyReducedModel, dict[str, AffinePolynomial]]:  # fmt: skip
-    """The model whose members are evaluated, see `declared_model`, and polynomials of the members."""
-    # A is a packed upper triangle (row by row). With `fixed` a basis that depends on the parameter is refused. The
-    # arrays of `beside` have polynomials, too. Those in `rotated` are the θ of A times a matrix, by name: one
-    # polynomial serves them and A. `check` may refuse a model by its program at one parameter, before it is
-    # interpolated.
-    box = reduced.problem.parameters
+    left_out: Sequence[str] = (),
+) -> dict[str, AffinePolynomial]:  # fmt: skip
+    """Polynomials of the members of a `declared_model`."""
+    # A is a packed upper triangle (row by row). The arrays of `beside` have polynomials, too. Those in `rotated` are
+    # the θ of A times a matrix, by name: one polynomial serves them and A. `check` may refuse a model by its program at
+    # one parameter, before it is interpolated. Members that are `left_out` have no polynomials.
+    box = queried.problem.parameters
     try:
-        queried = declared_model(reduced)
-        if fixed and isinstance(queried, HyperReducedModel) and queried.space is not None:
-            raise RequestError("the enrichment changes the basis at every parameter; C sources are for fixed bases")
         first = members_of(queried, box.lower, coefficients_of(queried, box.lower))
         if not len(first.f) or not len(first.g):
             raise RequestError("the model has no unknowns or no constraints")
@@ -59,13 +56,17 @@ def member_polynomials(
         theta_of = {name: "A" if name in rotated else name for name in terms}
         # Of a constant member nothing is sampled: thousands of copies of A take gigabytes.
         packed = _packed(first, len(first.f), box.lower)
-        constant = {name: packed[name][None, :] for name in reduced.problem.constant if name not in terms}
+        constant = {name: packed[name][None, :] for name in queried.problem.constant if name not in terms}
         terms |= constant
+        chosen = [name for name in MEMBERS if name not in left_out]
 
         def evaluate(mu: Array) -> dict[str, Array]:
             theta = coefficients_of(queried, mu)
-            found = _packed(members_of(queried, mu, theta), len(first.f), mu)
-            found |= {} if beside is None else beside(theta)
+            found = {} if beside is None else dict(beside(theta))
+            # Members whose terms are known are not evaluated.
+            if any(name not in terms for name in chosen):
+                packed = _packed(members_of(queried, mu, theta), len(first.f), mu)
+                found |= {name: packed[name] for name in chosen}
             # In place of a sum of known terms its θ.
             found |= {name: theta[member] for name, member in theta_of.items()}
             return found | {name: np.ones(1) for name in constant}
@@ -86,22 +87,26 @@ def member_polynomials(
     if shared:
         # The terms of the certificate are not the best for A.
         polynomials["A"] = compressed(polynomials["A"], tolerance)
-    return queried, polynomials
+    return polynomials
 
 
-def declared_model(queried: AnyReducedModel) -> AnyReducedModel:
+def declared_model(queried: AnyReducedModel, *, coded: bool = False) -> AnyReducedModel:
     """The model without high-fidelity assembly where its problem declares all members constant or affine sums."""
-    # Their terms are projected, whatever the assembly of the cell was; any other model is returned as it is.
+    # Their terms are projected, whatever the assembly of the cell was; any other model is returned as it is. If `coded`
+    # B and g may have C code instead. Raises a `RequestError` for declarations that are false.
     if isinstance(queried, HyperReducedModel):
         return queried
     problem = queried.problem
     training = training_parameters(problem)
-    if queried.enrichment.supply is not None or not set(MEMBERS) <= {*problem.constant, *problem.affine}:
-        check_affine(problem, training)
-        return queried
-    # All members are declared, so that nothing is left to interpolate.
-    members = affine_decomposition(problem, training, tolerance=TOLERANCE)
-    return HyperReducedModel(queried, hyper_reduce(queried, members))
+    known = {*problem.constant, *problem.affine, *("Bg" if coded and problem.contact_source() is not None else "")}
+    try:
+        if queried.enrichment.supply is not None or not set(MEMBERS) <= known:
+            check_affine(problem, training)
+            return queried
+        members = affine_decomposition(problem, training, tolerance=TOLERANCE)
+        return HyperReducedModel(queried, hyper_reduce(queried, members))
+    except NumericalError as error:
+        raise RequestError(f"the model cannot be evaluated in the whole parameter box: {error}") from None
 
 
 def declared_terms(queried: AnyReducedModel) -> dict[str, Array]:

@@ -154,6 +154,11 @@ class LoadCoordinates:
         """Number k of the multipliers that the loads are of."""
         return int(self._fixed.shape[1])
 
+    @property
+    def terms(self) -> tuple[Array, Array]:
+        """Coordinates (k×d) of the supremizers of the fixed loads, and (j×d) of those of each load that may vary."""
+        return self._fixed.T, self._reached.T
+
     def supremizers(self, varying: Array) -> Array:
         """Coordinates (d'×k) of the supremizers with `varying` (j×k) added to the fixed loads; those after d' are zero.
 

@@ -12,14 +12,16 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, read_only
-from vibench.errors import NumericalError
+from vibench.errors import NumericalError, UnsupportedError
 from vibench.highfidelity import active_set
+from vibench.interfaces.contact_source import ContactSource
 from vibench.interfaces.outputs import MeshFields, Output, Picture
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.linalg.inner_product import InnerProduct, singular_values
 from vibench.model.affine import INTERPOLATION_RTOL, assembled_members, decomposed, held_out_error, is_missed
+from vibench.offline.compiled import compiled_contact, compiler
 from vibench.stability.coercivity import Quotients
 from vibench.testing.case import (
     Arrays,
@@ -222,6 +224,27 @@ def on_contact(case: ProblemCase) -> Iterator[str]:
                 _check_contact(case, dofs, mu, full)
         B, g = problem.constraint(mu)
         _compare(case, "constraint", mu, {"B": B, "g": g}, full)
+    if dofs is not None and defined and (source := problem.contact_source()) is not None:
+        yield from _check_contact_source(case, source, dofs)
+
+
+def _check_contact_source(case: ProblemCase, source: ContactSource, dofs: Indices) -> Iterator[str]:
+    """Compare the constraint that C code evaluates with B and g."""
+    try:
+        compiler()
+    except UnsupportedError as error:
+        yield Note(f"`contact_source` is not compared: {error}")
+        return
+    try:
+        evaluate = compiled_contact(source, (case.plugin.W.dim, len(dofs)))
+    except UnsupportedError as error:
+        raise ConformanceError(f"`contact_source`: {error}") from error
+    for where, mu in case.arguments.items():
+        if (contact := evaluate(mu)) is None:
+            raise ConformanceError(f"`contact_source` has no constraint {where}, where `contact` has one")
+        full, columns = case.results[where], "B[:, contact_dofs]"
+        own = full | {columns: full["B"][:, dofs]}
+        _compare(case, "contact_source", mu, {columns: contact.B, "g": contact.g}, own)
 
 
 def _dofs_fault(dofs: object, n: int) -> str:

@@ -1,5 +1,6 @@
 """Hertz contact of two discs, at a fixed approach and at one that is a parameter, and its coupling of meshes."""
 
+import shutil
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolver, solve_high_fidelity
 from vibench.model.affine import Evaluation, affine_decomposition
+from vibench.offline.compiled import compiled_contact
 from vibench.reduction.supremizers import constraint_classes, proportionality
 from vibench_problems.hertz import Hertz
 from vibench_problems.line_contact import measured, theory
@@ -142,6 +144,19 @@ def test_loads_of_multipliers_are_those_of_the_matrix_at_every_radius(options: d
         assert np.allclose(bounds, eta.T @ contact.g, rtol=1e-13, atol=1e-16)
     with pytest.raises(NumericalError, match="the radius of disc 2 is too small"):
         loads.varying(np.array([0.5, 0.11])[: problem.parameters.dim])
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+@pytest.mark.parametrize("options", [{}, {"quadrature": 3, "ratio": 3.0}, {"approach": "parameter"}], ids=str)
+def test_c_code_has_the_constraint_at_every_radius(options: dict[str, Any]) -> None:
+    problem = Hertz(300, **options)
+    evaluate = compiled_contact(problem.contact_source(), (problem.W.dim, len(problem.contact_dofs)))
+    for radius in (0.68, 0.7, 0.93, 1.0, 1.3, 4.0):  # the first and the last are outside the box
+        mu = np.array([radius, 0.11])[: problem.parameters.dim]
+        contact, found = problem.contact(mu), evaluate(mu)
+        assert abs(found.B - contact.B).max() <= 1e-15 * abs(contact.B).max()
+        assert found.g == pytest.approx(contact.g, rel=0.0, abs=1e-15 * np.abs(contact.g).max())
+    assert evaluate(np.array([0.5, 0.11])[: problem.parameters.dim]) is None  # disc 2 is too small
 
 
 LOADED, PAPER = cache(partial(Hertz, "coarse", approach="parameter")), cache(partial(Hertz, "coarse"))

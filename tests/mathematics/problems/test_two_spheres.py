@@ -1,3 +1,4 @@
+import shutil
 from functools import cache
 from itertools import pairwise
 
@@ -11,6 +12,7 @@ from scipy.optimize import nnls
 from skfem import Basis, BilinearForm, ElementHex1, ElementQuad2, ElementVector, FacetBasis, MeshHex, MeshQuad
 
 from vibench import HighFidelitySolver, NumericalError, ParameterBox, RequestError, create
+from vibench.offline.compiled import compiled_contact
 from vibench_problems.cube_shells import graded_block
 from vibench_problems.elastic_forms import interior
 from vibench_problems.hemisphere import drop, hemisphere
@@ -105,6 +107,17 @@ def test_loads_of_given_pressures_are_those_of_the_assembled_condition() -> None
         found[loads.first :] += varying
         assert found == pytest.approx(contact.B.T @ eta, abs=1e-15)
         assert bound == pytest.approx(eta.T @ contact.g, abs=1e-15)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+def test_c_code_has_the_assembled_condition() -> None:
+    one, _ = spheres(4, 0.2)
+    evaluate = compiled_contact(one.contact_source(), (one.W.dim, len(one.contact_dofs)))
+    for mu in [*one.parameters.sample(3, seed=1), one.parameters.lower, one.parameters.upper]:
+        contact, found = one.contact(mu), evaluate(mu)
+        assert abs(found.B - contact.B).max() <= 2e-15 * abs(contact.B).max()
+        assert found.g == pytest.approx(contact.g, rel=0.0, abs=2e-15 * np.abs(contact.g).max())
+    assert evaluate(0.1 * one.parameters.lower) is None  # the body above is too small
 
 
 @pytest.mark.parametrize("width", [0.02, 0.4])

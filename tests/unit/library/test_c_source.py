@@ -28,6 +28,7 @@ from vibench.model.chebyshev import AffinePolynomial
 from vibench.offline import c_source
 from vibench.qp.exact import exact_solution
 from vibench.qp.verification import infeasibility_certificate, kkt_residuals
+from vibench_problems.hertz import Hertz
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="NO C COMPILER (cc, gcc): exported C sources are not tested")
@@ -107,7 +108,7 @@ def certify(model: vibench.Model, file: Path, tolerance: float) -> tuple[Certify
     """The C source of a model: the code, u, λ and four bounds at a parameter, corrected or not; what it is made of."""
     whole = export_model(model, file, tolerance=tolerance, evaluations=6000, c=True)
     arrays, found = whole.arrays, library(file.with_suffix(".c"), PLAIN)
-    (rows, loads), basis = arrays["certificate_responses"].shape, arrays["basis"]
+    rows, loads, basis = len(arrays["generators"]), len(arrays["certificate_rows"]), arrays["basis"]
     found.model_of_contact.restype = ctypes.c_double
 
     def certified(mu: np.ndarray, corrected: bool) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
@@ -233,7 +234,7 @@ def test_a_c_source_has_its_bounds(problem: str, small_run: vibench.Run, tmp_pat
     assert names == ["load", "force */", "both"]
     script = Exported(tmp_path / "model.npz")
     x, alpha, residuals = np.zeros(data["basis"].shape[1]), np.zeros(data["generators"].shape[1]), np.zeros(3)
-    lam, shift = (np.zeros(size) for size in data["certificate_responses"].shape)
+    lam, shift = (np.zeros(len(data[name])) for name in ("generators", "certificate_rows"))
     bounds, values, errors, plain = (np.zeros(3) for _ in range(4))
     for mu in model.parameters.sample(10, seed=5):
         exact = model.high_fidelity(mu)
@@ -289,8 +290,7 @@ def test_both_methods_of_the_correction_in_c_find_that_of_vibench(steps: int, tm
     parts = [
         "#include <float.h>\n#include <math.h>\n#include <string.h>\n"
         f"enum {{ LOADS = {size}, STEPS = {steps} }};\n"
-        "double certificate_inverse[LOADS * LOADS], certificate_responses[LOADS * LOADS];\n"
-        f"int certificate_rows[] = {{ {', '.join(map(str, range(size)))} }};\n",
+        "double certificate_inverse[LOADS * LOADS], certificate_compliance[LOADS * LOADS];\n",
         basic[basic.index("#define SUM(") : basic.index("/* Whether all numbers are finite")],
         text[text.index("static const double *inverse_row(") : text.index("/* out of M_kk")],
         text[text.index("/* out of M_kk") : text.index("/* A w with B w >= s")].replace("static", ""),
@@ -300,7 +300,7 @@ def test_both_methods_of_the_correction_in_c_find_that_of_vibench(steps: int, tm
     found.complement.argtypes = [ctypes.c_double, POINTER, POINTER, ctypes.POINTER(ctypes.c_int), POINTER]
     matrix, compliance = (
         np.ctypeslib.as_array((ctypes.c_double * size**2).in_dll(found, f"certificate_{name}")).reshape(size, size)
-        for name in ("inverse", "responses")
+        for name in ("inverse", "compliance")
     )
     for seed in range(80):
         rng = np.random.default_rng(seed)
@@ -318,6 +318,84 @@ def test_both_methods_of_the_correction_in_c_find_that_of_vibench(steps: int, tm
             answers.append(nu.copy())
         for one in answers:
             assert one == pytest.approx(expected, abs=1e-9 * np.abs(fixed).max())
+
+
+PRIMAL = {"offline-pga": 0.5, "online-supremizers": None}
+"""Strategies of a fixed space, and of another one at every parameter, and their tolerances."""
+
+
+def reduced_from(problem: vibench.Problem, primal: str) -> vibench.Model:
+    strategies = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", primal)
+    stops = vibench.Stop(tolerance=1e-2), vibench.Stop(tolerance=1e-1)
+    few = vibench.create("sampling strategy", "random", {"size": 12, "seed": 1})
+    given = {"tolerance": PRIMAL[primal], "training": few, "assembly": "reduced", "bounds": True}
+    return vibench.Reduction(problem, *strategies, *stops, **given).model
+
+
+@pytest.mark.parametrize("primal", PRIMAL)
+def test_constraints_in_the_code_of_a_problem_have_c_programs_with_bounds(primal: str, tmp_path: Path) -> None:
+    model = reduced_from(Hertz(300), primal)
+    whole = export_model(model, tmp_path / "model.npz", c=True)
+    assert (whole.about["certificate"], set(whole.members)) == ("certified", {"A", "f"})
+    assert not (tmp_path / "reduced_model.py").exists()
+    with pytest.raises(ValueError, match="is no vibench reduced model 1"):
+        Exported(tmp_path / "model.npz")
+    found, arrays = library(tmp_path / "model.c", PLAIN), whole.arrays
+    found.model_of_contact.restype = ctypes.c_double
+    x, alpha, residuals = np.zeros(arrays["basis"].shape[1]), np.zeros(arrays["generators"].shape[1]), np.zeros(3)
+    lam, shift, bounds = np.zeros(model.problem.W.dim), np.zeros(len(arrays["certificate_rows"])), np.zeros(3)
+    names = [output["name"] for output in whole.about["outputs"]["linear"]]
+    values, errors = np.zeros((2, len(names)))
+    for mu in model.parameters.sample(20, seed=3):
+        own = model.solve(mu, accuracy=1e-13, corrected=False)
+        assert found.model_solve(*pointers(mu, x, alpha, residuals)) == 0
+        assert residuals.max() <= 1e-12
+        assert np.linalg.norm(arrays["basis"] @ x - own.u) <= 1e-9 * np.linalg.norm(own.u)
+        assert found.model_certify(*pointers(mu, x, alpha), 0, *pointers(lam, shift, bounds)) == 0
+        assert np.linalg.norm(lam - own.lam) <= 1e-9 * np.linalg.norm(own.lam)
+        proved = own.bound.u_energy, own.bound.lambda_natural, own.bound.relative
+        assert bounds == pytest.approx(proved, rel=2e-9)
+        beside = model.solve(mu, accuracy=1e-13, corrected=False, of="contact").bound.relative
+        assert found.model_of_contact(*pointers(mu, alpha, lam, bounds)) == pytest.approx(beside, rel=2e-9)
+        found.model_certified_outputs(*pointers(mu, x, lam, shift, bounds, values, errors))
+        assert values == pytest.approx([own.outputs[name] for name in names], rel=1e-9)
+        assert errors == pytest.approx([own.output_bounds[name] for name in names], rel=2e-9)
+        # the corrected pair of such problems takes more than prepared matrices
+        assert found.model_certify(*pointers(mu, x, alpha), 1, *pointers(lam, shift, bounds)) == 5
+    for wrong in (np.nan, np.inf, 1e-3):  # at the last one the body is too small
+        mu[0] = wrong
+        assert found.model_solve(*pointers(mu, x, alpha, residuals)) == 19
+        assert np.isnan([*x, *alpha, *residuals]).all()
+        given = pointers(mu, np.ones_like(x), np.ones_like(alpha))
+        assert found.model_certify(*given, 0, *pointers(lam, shift, bounds)) == 4
+        assert np.all(bounds == np.inf)
+
+
+class Turning(Expressed):
+    """The same with a B of two terms, whose supremizers span another space at every parameter."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        B = self.affine["B"].terms[0]
+        members = {**self.affine, "B": [("1 + a", B), ("b", sp.csr_array(np.roll(B.toarray(), 1, axis=1)))]}
+        self.declare(**members)
+
+
+def test_spaces_that_change_with_the_parameter_have_c_programs(tmp_path: Path) -> None:
+    dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "online-supremizers")
+    stops = vibench.Stop(tolerance=1e-1), vibench.Stop(tolerance=1e-1)
+    model = vibench.Reduction(Turning(), dual, primal, *stops, assembly="reduced").model
+    assert model.reduced.space is not None
+    arrays = export_model(model, tmp_path / "model.npz", c=True, tolerance=1e-2).arrays
+    solve = compiled(tmp_path / "model.c", arrays["basis"].shape[1], arrays["generators"].shape[1])
+    for mu in model.parameters.sample(20, seed=3):
+        code, x, alpha, residuals = solve(mu)
+        reduced = model.reduced.assemble(mu)
+        exact = exact_solution(reduced.program)
+        u = reduced.reconstruct(exact.x[:, None])[:, 0]
+        assert (code, residuals.max() <= 1e-12) == (0, True)
+        assert np.linalg.norm(arrays["basis"] @ x - u) <= 1e-9 * np.linalg.norm(u)
+        assert np.linalg.norm(alpha - exact.alpha) <= 1e-9 * np.linalg.norm(exact.alpha)
 
 
 def linear(constant: np.ndarray, factors: dict[int, int], dimension: int) -> AffinePolynomial:

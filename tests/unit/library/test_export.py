@@ -392,8 +392,6 @@ def test_models_without_export_are_refused(run: vibench.Run, tmp_path: Path, mon
     model = model_of(run, "radial-obstacle")
     with pytest.raises(vibench.RequestError, match='export the same cell with assembly = "reduced"'):
         export_model(model_of(run, "obstacle", "online-supremizers", "full"), tmp_path / "model.npz")
-    with pytest.raises(vibench.RequestError, match="C sources are for fixed bases"):
-        export_model(per_parameter(model), tmp_path / "model.npz", c=True)
     (tmp_path / "reduced_model.py").write_text("precious")
     with pytest.raises(vibench.RequestError, match="is not the runtime of this version"):
         export_model(model, tmp_path / "model.npz")
@@ -416,7 +414,7 @@ def test_constant_members_are_not_sampled_coefficients_once(run: vibench.Run, mo
 
     monkeypatch.setattr(reduced, "coefficients", lambda at: points.append(at) or coefficients(at))
     monkeypatch.setattr(polynomials, "interpolate_on_box", sizes)
-    _, found = polynomials.member_polynomials(reduced, 1e-11, 4096, fixed=True)
+    found = polynomials.member_polynomials(reduced, 1e-11, 4096)
     assert reduced.problem.constant
     assert {sampled[0][name] for name in reduced.problem.constant} == {1}
     (mu,) = reduced.problem.parameters.sample(1, seed=5)

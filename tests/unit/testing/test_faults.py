@@ -42,6 +42,7 @@ FAULTS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "NoContact": ("assembly on the contact", "contact returns a NoneType at mu = [4.0]"),
         "LoadsWrong": ("assembly on the contact", "Bᵀη of `contact_loads` differs from that of `assemble`"),
         "LoadsReachFarther": ("assembly on the contact", "more than `reach` of `contact_loads`"),
+        "SourceWrong": ("assembly on the contact", "g of `contact_source` differs from that of `assemble`"),
         "ContactOfNothing": ("assembly on the contact", "`contact` is defined but `contact_dofs` is not"),
         "ContactChangesTheParameter": ("assembly on the contact", "ValueError: output array is read-only (broken_p"),
         "Overlooked": ("assembly on the contact", "B touches 1 unknowns outside `contact_dofs`", "the first is 0"),

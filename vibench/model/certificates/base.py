@@ -93,6 +93,14 @@ class OnlineInfSup:
         entries.eliminate_zeros()
         return (*sp.coo_array(entries).coords, entries.data)
 
+    @property
+    def entries(self) -> tuple[Mask, tuple[Indices, Indices, Array]]:
+        """The bodies (k,), and the ends of the rows, columns and values of B₀ there, without zeros."""
+        rows, columns, values = self._known
+        bodies = np.zeros(self.constraint.shape[1], bool) if self.bodies is None else self.bodies
+        ends = np.cumsum(np.bincount(rows, minlength=self.constraint.shape[0]))
+        return bodies, (ends, columns, values)
+
     def lower_bound(self, theta: float, B: Callable[[], SparseMatrix], gamma: float) -> tuple[float, str]:
         """A lower bound of β_A(µ), 0 if there is none, and which it is or why there is none, from γ(µ).
 
