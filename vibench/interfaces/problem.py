@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -126,22 +126,22 @@ class Problem(ABC):
     immutable once built, and `assemble` depends on nothing but the parameter.
     """
 
-    parameters: ParameterBox
+    parameters: Annotated[ParameterBox, "d"]
     """Names, bounds and units of the parameters."""
     V: Annotated[InnerProduct, "n"]
     """Inner product of the primal space, X_V (n×n), independent of the parameter."""
     W: Annotated[InnerProduct, "m"]
     """Inner product of the multiplier space, X_W (m×m), in a basis whose nonnegative coefficients are the cone W⁺."""
-    constant: ClassVar[frozenset[str]] = frozenset()
+    constant: ClassVar[Set[str]] = frozenset()
     """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu."""
     affine: Mapping[str, AffineSum] = MappingProxyType({})
     """Members that are sums Σ_q θ_q(mu) · terms_q, by name; reduced assembly projects the terms and is exact.
 
     `affine["A"].terms` and `affine["A"].coefficients(mu)` are the terms and θ(mu), as for bounds of the coercivity.
     """
-    entrywise: ClassVar[frozenset[str]] = frozenset()
+    entrywise: ClassVar[Set[str]] = frozenset()
     """Members that `sampler` evaluates entry by entry."""
-    elementwise: ClassVar[frozenset[str]] = frozenset()
+    elementwise: ClassVar[Set[str]] = frozenset()
     """Members, "A" and "f" or one of them, that `element_sampler` integrates element by element."""
     licence: str = ""
     """Licence of the data that the problem is made of, "unknown" if it is; "" where that of its distribution holds."""

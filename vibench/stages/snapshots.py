@@ -16,7 +16,7 @@ from vibench.errors import NumericalError, at_parameter, message_of
 from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.formulations import Snapshots
 from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.interfaces.validation import Fingerprint, ReferenceAssembly, checked_assembly
+from vibench.interfaces.validation import Fingerprint, ReferenceAssembly, checked_assembly, checked_diagnostics
 from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.error_bounds import reference_bound
 from vibench.offline.assemblies import assemblies
@@ -213,7 +213,7 @@ class SnapshotStage(Stage):
     def _diagnostics(self, problem: Problem, mus: Array, first: int) -> tuple[History, ...]:
         by_quantity: dict[str, list[float]] = {}
         for mu in mus:
-            for quantity, value in problem.diagnostics(mu).items():
+            for quantity, value in checked_diagnostics(problem, mu).items():
                 by_quantity.setdefault(quantity, []).append(float(value))
         return tuple(History.of(self.parameters.role, name, values, first) for name, values in by_quantity.items())
 

@@ -223,23 +223,6 @@ def unmutated(function: str, arrays: Arrays, call: Callable[[], T]) -> T:
     return result
 
 
-def array_fault(name: str, value: Any, shape: tuple[int, ...], *, sparse: bool = False) -> str:
-    """Why a value is not a finite float64 array of a shape, dense or sparse (CSR, CSC); "" if it is."""
-    if not (sp.issparse(value) if sparse else isinstance(value, np.ndarray)):
-        right = f"sparse CSR matrix: scipy.sparse.csr_array({name})" if sparse else f"NumPy array of shape {shape}"
-        return f"{name} is a {type(value).__name__}; expected a {right}"
-    if value.shape != shape:
-        return f"{name} has shape {value.shape}; expected {shape}"
-    if sparse and value.format not in ("csr", "csc"):
-        return f"{name} has the sparse format {value.format}; expected CSR or CSC: scipy.sparse.csr_array({name})"
-    if value.dtype != np.float64:
-        return f"{name} has dtype {value.dtype}; expected float64"
-    wrong = np.flatnonzero(~np.isfinite(_entries(value)))
-    if not len(wrong):
-        return ""
-    return f"{name} is not finite: entry {_place(value, wrong[0])} is {_entries(value)[wrong[0]]}"
-
-
 def at(mu: Array) -> str:
     """A parameter (d,) in words: "at mu = [4.0, 0.1]"."""
     return f"at mu = {[float(f'{value:.12g}') for value in mu]}"

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from vibench.arrays import Array, read_only
+from vibench.arrays import Array, read_only, taken
 from vibench.errors import NumericalError, RequestError, VibenchError
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.strategies import (
@@ -34,7 +34,7 @@ from vibench.reduction.cones import project_on_cone
 from vibench.reduction.nested import NestedStrategy, grow_through
 from vibench.stages.artefacts import dumps, loads
 from vibench.stages.enrichment import BuiltEnrichment
-from vibench.testing.case import Arrays, Case, array_fault, at, difference
+from vibench.testing.case import Arrays, Case, at, difference
 from vibench.testing.checks import Check, ConformanceError, Doubt, Note, raised
 
 
@@ -219,14 +219,12 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
             yield Note(f"{name}: {built.kind}" + ("" if vectors is None else f", {vectors.shape[1]} vectors"))
 
     def _fault(self, built: Enrichment, offline: Offline) -> str:
-        V, W = offline.problem.V, offline.problem.W
         try:
-            check_enrichment(built, V, offline.basis)
+            check_enrichment(built, offline.problem.V, offline.basis)
+            for name, value in self.arrays(built, offline).items() if built.supply is not None else ():
+                taken(value, name, offline.problem.V.dim, "count")
         except NumericalError as error:
             return str(error)
-        for name, value in self.arrays(built, offline).items():
-            if fault := array_fault(name, value, (W.dim if name == "eta" else V.dim, *np.shape(value)[-1:])):
-                return fault
         return ""
 
     def kind(self) -> Iterator[str]:
