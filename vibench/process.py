@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import builtins
 import contextlib
-import gc
 import locale
 import os
 import random
@@ -44,7 +43,6 @@ def put_back() -> Iterator[dict[str, bool]]:
 def _parts() -> dict[str, tuple[Callable[[], Any], Callable[[Any], object]]]:
     """How every part of the state is read and put back; those come first that reading the others needs."""
     owned = {sys: ("path", "meta_path", "path_hooks", "stdin", "stdout", "stderr"), warnings: ("filters",)}
-    priority = os.PRIO_PROCESS, 0
     return {
         "the recursion limit": (sys.getrecursionlimit, sys.setrecursionlimit),
         "builtins": (builtins.__dict__.copy, builtins.__dict__.update),
@@ -55,20 +53,15 @@ def _parts() -> dict[str, tuple[Callable[[], Any], Callable[[Any], object]]]:
             for name in names
         },
         "numpy.seterr": (np.geterr, lambda known: np.seterr(**known)),
-        "the collection of garbage": (gc.isenabled, lambda known: gc.enable() if known else gc.disable()),
         "the limits of resources": (_limits, _set_limits),
-        "the priority": (partial(os.getpriority, *priority), partial(os.setpriority, *priority)),
         "the umask": (_umask, os.umask),
         "the working directory": (_folder, os.chdir), "the environment": (os.environ.copy, _set_environment),
         "the folder of temporary files": (tempfile.gettempdir, partial(setattr, tempfile, "tempdir")),
         "the state of random": (random.getstate, random.setstate),
         "the state of numpy.random": (_numpy_random, np.random.set_state),
         "the handlers of signals": (_handlers, _set_handlers),
-        "the signals held back": (
-            partial(signal.pthread_sigmask, signal.SIG_BLOCK, ()), partial(signal.pthread_sigmask, signal.SIG_SETMASK)
-        ),
         # A timer that goes off later ends the work of others.
-        "the timers": (_timers, _set_timers),
+        **{f"the timer {one}": (partial(_ends, one), partial(_set_timer, one)) for one in range(3)},
         "the locale": (partial(locale.setlocale, locale.LC_ALL), partial(locale.setlocale, locale.LC_ALL)),
     }  # fmt: skip
 
@@ -121,15 +114,15 @@ def _set_handlers(known: Mapping[signal.Signals, Any]) -> None:
             signal.signal(number, handler)
 
 
-def _timers() -> dict[int, float]:
-    """When the timers go off, in hundreds of seconds of their clocks."""
-    clocks = {signal.ITIMER_REAL: time.monotonic, signal.ITIMER_VIRTUAL: time.process_time}
-    clocks |= {signal.ITIMER_PROF: time.process_time}
-    left = {one: signal.getitimer(one)[0] for one in clocks}
-    return {one: left[one] and round(clocks[one]() + left[one], -2) for one in clocks}
+def _now(timer: int) -> float:
+    return time.monotonic() if timer == signal.ITIMER_REAL else time.process_time()
 
 
-def _set_timers(known: Mapping[int, float]) -> None:
-    for one, ends in known.items():
-        now = time.monotonic() if one == signal.ITIMER_REAL else time.process_time()
-        signal.setitimer(one, ends and max(ends - now, 1.0))
+def _ends(timer: int) -> float:
+    """When a timer goes off, in hundreds of seconds; 0 if never."""
+    left = signal.getitimer(timer)[0]
+    return left and round(_now(timer) + left, -2)
+
+
+def _set_timer(timer: int, ends: float) -> None:
+    signal.setitimer(timer, ends and max(ends - _now(timer), 1.0))

@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar, cast, get_args, get_origin
 
 import numpy as np
 
-from vibench.errors import RequestError, unknown_name
+from vibench.errors import RequestError, VibenchError, unknown_name
 from vibench.text import shown
 
 T = TypeVar("T")
@@ -144,18 +144,30 @@ class _Signature:
             raise RequestError(f"{self._title}: {error}") from None
 
 
-def refuse_others(what: str, value: Any, rule: Rule) -> None:
-    """Raise a `RequestError` that names a value for which a rule does not hold."""
+def refuse_others(what: str, value: Any, rule: Rule, error: type[VibenchError] = RequestError) -> None:
+    """Raise an error that names a value for which a rule does not hold."""
     if rule.holds(value):
         return
     if all(hasattr(value, name) for name, _ in rule.parts):
         for name, inner in rule.parts:
-            refuse_others(f"{name} in {what}", getattr(value, name), inner)
+            refuse_others(f"{name} in {what}", getattr(value, name), inner, error)
     if rule.axes and is_plain(value) and not _has_axes(value, rule.axes):
-        raise RequestError(f"{what} has the shape {value.shape}, expected {rule.right}")
+        raise error(f"{what} has the shape {value.shape}, expected {rule.right}")
     if rule.axes and is_plain(value) and value.dtype.kind == "f" and len(wrong := np.argwhere(~np.isfinite(value))):
-        raise RequestError(f"{what} has an entry that is not finite, first at {wrong[0].tolist()}")
-    raise RequestError(f"{what} is {shown(value)}, expected {rule.right}")
+        raise error(f"{what} has an entry that is not finite, first at {wrong[0].tolist()}")
+    raise error(f"{what} is {shown(value)}, expected {rule.right}")
+
+
+def check_attributes(made: Any, base: type, error: type[VibenchError] = RequestError) -> None:
+    """Raise an error if an attribute of an object of a plugin is not what the annotations of a class say."""
+    for name, rule in _attributes(base).items():
+        refuse_others(f"`{name}` of {type(made).__name__}", getattr(made, name, None), rule, error)
+
+
+@functools.cache
+def _attributes(base: type) -> dict[str, Rule]:
+    hints = typing.get_type_hints(base, include_extras=True).items()
+    return {name: rule_of(get_args(hint)[0] if get_origin(hint) is typing.ClassVar else hint) for name, hint in hints}
 
 
 @functools.cache

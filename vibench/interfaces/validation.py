@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Annotated, Any, ClassVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,11 +17,11 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, Mask, read_only, real_matrix, real_vector, taken
 from vibench.errors import NumericalError, RequestError, at_parameter
 from vibench.interfaces.absent_rows import ABSENT, is_absent, settled_bounds
-from vibench.interfaces.outputs import Output
+from vibench.interfaces.outputs import Output, Picture
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, Sampling, check_sample
 from vibench.linalg.inner_product import InnerProduct
-from vibench.signatures import refuse_others, rule_of
+from vibench.signatures import check_attributes, refuse_others, rule_of
 
 
 def check_cone(cone: object, W: InnerProduct) -> Cone:
@@ -191,12 +191,11 @@ def _probed(array: Any) -> Array:
 
 def check_declarations(problem: Problem) -> None:
     """Raise an error if what a problem is declared to have, as by its annotations, is something else."""
-    hints = get_type_hints(Problem, include_extras=True)
-    hints |= {"outputs": Sequence[Output], "contact_dofs": Annotated[Indices, "k"] | None}
+    check_attributes(problem, Problem, NumericalError)
+    hints: dict[str, Any] = {"outputs": Sequence[Output], "contact_dofs": Annotated[Indices, "k"] | None}
     hints |= {"element_dofs": Annotated[Indices, "k", "e"]} if problem.elementwise else {}
     for name, hint in hints.items():
-        rule = rule_of(get_args(hint)[0] if get_origin(hint) is ClassVar else hint)
-        refuse_others(f"`{name}` of the problem", getattr(problem, name, None), rule)
+        refuse_others(f"`{name}` of the problem", getattr(problem, name), rule_of(hint), NumericalError)
     members = {"constant": MEMBERS, "affine": MEMBERS, "entrywise": MEMBERS, "elementwise": ("A", "f")}
     for name, known in members.items():
         for other in sorted(set(getattr(problem, name)) - set(known)):
@@ -221,8 +220,18 @@ def check_declarations(problem: Problem) -> None:
 def checked_diagnostics(problem: Problem, mu: Array) -> Mapping[str, float]:
     """`problem.diagnostics(mu)`; raises an error if these are no finite numbers by name."""
     found = problem.diagnostics(mu)
-    refuse_others(f"what `diagnostics` returned at mu = {mu.tolist()}", found, rule_of(Mapping[str, float]))
+    what = f"what `diagnostics` returned at mu = {mu.tolist()}"
+    refuse_others(what, found, rule_of(Mapping[str, float]), NumericalError)
     return found
+
+
+def checked_picture(problem: Problem, mu: Array, u: Array, lam: Array) -> Picture | None:
+    """`problem.picture` of a solution, into which it cannot write; a `NumericalError` if it is no picture of λ."""
+    picture = problem.picture(read_only(mu), read_only(u), read_only(lam))
+    refuse_others("what `picture` returned", picture, rule_of(Picture | None), NumericalError)
+    if picture is not None and picture.multiplier.shape != lam.shape:
+        raise NumericalError(f"picture.multiplier has shape {picture.multiplier.shape}; expected {lam.shape}")
+    return picture
 
 
 def checked_contact(problem: Problem, mu: Array) -> Contact:
