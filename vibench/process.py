@@ -31,8 +31,8 @@ def put_back() -> Iterator[dict[str, bool]]:
     finally:
         for name, read, write, value in before:
             if read() != value:
-                # Limits and priorities may go one way alone.
-                with contextlib.suppress(OSError, ValueError):
+                # Limits may go one way alone, and a library may have a handler that Python cannot set.
+                with contextlib.suppress(OSError, ValueError, TypeError):
                     write(value)
                 changed[name] = read() == value
         if lost := {name: one for name, one in modules.items() if sys.modules.get(name) is not one}:
@@ -53,13 +53,18 @@ def _parts() -> dict[str, tuple[Callable[[], Any], Callable[[Any], object]]]:
             for name in names
         },
         "numpy.seterr": (np.geterr, lambda known: np.seterr(**known)),
-        "the limits of resources": (_limits, _set_limits),
+        **{
+            f"the limit {name}": (partial(resource.getrlimit, one), partial(resource.setrlimit, one))
+            for name, one in vars(resource).items()
+            if name.startswith("RLIMIT_")
+        },
         "the umask": (_umask, os.umask),
         "the working directory": (_folder, os.chdir), "the environment": (os.environ.copy, _set_environment),
         "the folder of temporary files": (tempfile.gettempdir, partial(setattr, tempfile, "tempdir")),
         "the state of random": (random.getstate, random.setstate),
         "the state of numpy.random": (_numpy_random, np.random.set_state),
-        "the handlers of signals": (_handlers, _set_handlers),
+        **{f"the handler of {one}": (partial(signal.getsignal, one), partial(signal.signal, one))
+           for one in signal.valid_signals()},
         # A timer that goes off later ends the work of others.
         **{f"the timer {one}": (partial(_ends, one), partial(_set_timer, one)) for one in range(3)},
         "the locale": (partial(locale.setlocale, locale.LC_ALL), partial(locale.setlocale, locale.LC_ALL)),
@@ -69,15 +74,6 @@ def _parts() -> dict[str, tuple[Callable[[], Any], Callable[[Any], object]]]:
 def _copy(owner: Any, name: str) -> Any:
     value = getattr(owner, name)
     return value[:] if isinstance(value, list) else value
-
-
-def _limits() -> dict[str, tuple[int, int]]:
-    return {one: resource.getrlimit(getattr(resource, one)) for one in dir(resource) if one.startswith("RLIMIT_")}
-
-
-def _set_limits(known: Mapping[str, tuple[int, int]]) -> None:
-    for name, limit in known.items():
-        resource.setrlimit(getattr(resource, name), limit)
 
 
 def _umask() -> int:
@@ -101,17 +97,6 @@ def _set_environment(known: Mapping[str, str]) -> None:
 def _numpy_random() -> tuple[Any, ...]:
     name, key, *rest = np.random.get_state()  # noqa: NPY002  plugins may use it
     return (name, np.asarray(key).tolist(), *rest)
-
-
-def _handlers() -> dict[signal.Signals, Any]:
-    return {number: signal.getsignal(number) for number in signal.valid_signals()}
-
-
-def _set_handlers(known: Mapping[signal.Signals, Any]) -> None:
-    for number, handler in known.items():
-        # `None` stands for a handler of a library, which Python cannot set.
-        if handler is not None and signal.getsignal(number) is not handler:
-            signal.signal(number, handler)
 
 
 def _now(timer: int) -> float:

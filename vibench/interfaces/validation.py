@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, Mask, read_only, real_matrix, real_vector, taken
-from vibench.errors import NumericalError, RequestError, at_parameter
+from vibench.errors import NumericalError, at_parameter, placed
 from vibench.interfaces.absent_rows import ABSENT, is_absent, settled_bounds
 from vibench.interfaces.outputs import Output, Picture
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
@@ -75,10 +75,8 @@ def training_parameters(problem: Problem, sampling: Sampling | None = None) -> A
     """The training set (P×d), by default the problem's; refused if it is no set of parameters of the box."""
     if sampling is not None:
         return check_sample(problem.parameters, sampling.parameters(problem.parameters))
-    try:
+    with placed("training_set"):
         return check_sample(problem.parameters, problem.training_set())
-    except RequestError as error:
-        raise NumericalError(f"training_set: {error}") from None
 
 
 def validation_parameters(problem: Problem, count: int, seed: int, sampling: Sampling | None = None) -> Array:
@@ -215,14 +213,6 @@ def check_declarations(problem: Problem) -> None:
             raise NumericalError(f"`{name}` ranges from {dofs.min()} to {dofs.max()}, {expected}")
         if dofs is not None and not least and np.any(np.diff(dofs.astype(np.int64)) <= 0):
             raise NumericalError("`contact_dofs` is not strictly increasing")
-
-
-def checked_diagnostics(problem: Problem, mu: Array) -> Mapping[str, float]:
-    """`problem.diagnostics(mu)`; raises an error if these are no finite numbers by name."""
-    found = problem.diagnostics(mu)
-    what = f"what `diagnostics` returned at mu = {mu.tolist()}"
-    refuse_others(what, found, rule_of(Mapping[str, float]), NumericalError)
-    return found
 
 
 def checked_picture(problem: Problem, mu: Array, u: Array, lam: Array) -> Picture | None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
 
 import numpy as np
 
+from vibench import signatures
 from vibench.arrays import Array, is_sound, read_only, taken
 from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
@@ -37,18 +38,7 @@ from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers, solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
-from vibench.signatures import (
-    Count,
-    Judged,
-    NotNegative,
-    Positive,
-    Share,
-    bordered,
-    check_attributes,
-    constructed,
-    refuse_others,
-    rule_of,
-)
+from vibench.signatures import Count, Judged, NotNegative, Positive, Share, bordered, constructed, rule_of
 from vibench.text import normal_name, shown
 from vibench.timing import NO_TIME, Seconds, timed
 
@@ -180,7 +170,7 @@ class Model:
         made = self.formulation.model(self.offline, self.built)
         if not isinstance(made, FormulationModel):
             raise NumericalError(f"the formulation made a {type(made).__name__}, expected a FormulationModel")
-        check_attributes(made, FormulationModel, NumericalError)
+        signatures.check_attributes(made, FormulationModel, NumericalError)
         if (added := made.enrichment or 0) > made.dimension:
             what = f"`enrichment` of the model is {added}, more than its `dimension`"
             raise NumericalError(f"{what}, {made.dimension}")
@@ -500,7 +490,7 @@ def _numbers(name: str, value: Any, expected: str) -> Array:
 
 def check_built(built: object) -> Mapping[str, Any]:
     """Return what a formulation has built, or refuse what is no mapping with texts as names."""
-    refuse_others("what `build` returned", built, rule_of(Mapping[str, Any]), NumericalError)
+    signatures.refuse_others("what `build` returned", built, rule_of(Mapping[str, Any]), NumericalError)
     return cast("Mapping[str, Any]", built)
 
 
@@ -516,7 +506,7 @@ def _taken(answer: object, model: FormulationModel) -> FormulationAnswer:
             raise NumericalError(f"{name} of the answer has {len(value)} coefficients, the model declares {most}")
     kinds = {"outcome": formulations.Outcome, "reason": str, "iterations": Count | None}
     for name, kind in (kinds | {"uncertainty": NotNegative | None}).items():
-        refuse_others(f"{name} of the answer", getattr(answer, name), rule_of(kind), NumericalError)
+        signatures.refuse_others(f"{name} of the answer", getattr(answer, name), rule_of(kind), NumericalError)
     return replace(answer, x=vectors["x"], alpha=vectors["alpha"])
 
 

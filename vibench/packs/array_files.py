@@ -152,10 +152,11 @@ class ArrayFiles:
         first = np.lib.format.read_magic(file) == (1, 0)
         read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = read_header(file)
-        if dtype.hasobject:
-            raise RequestError("it holds Python objects (a pickle), which are not loaded; save numbers")
-        if dtype.kind not in "biufcS":
-            raise RequestError(f"it holds values of type {dtype}; expected numbers")
+        if dtype.hasobject or dtype.kind not in "biufcS":
+            objects = "Python objects (a pickle), which are not loaded"
+            raise RequestError(
+                f"it holds {objects if dtype.hasobject else f'values of type {dtype}'}; expected numbers"
+            )
         if min(shape, default=0) < 0:
             raise RequestError(f"its shape {size_of(shape)} is negative: it is damaged")
         count = math.prod(map(int, shape))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -16,7 +16,7 @@ from vibench.errors import NumericalError, at_parameter, message_of
 from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.formulations import Snapshots
 from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.interfaces.validation import Fingerprint, ReferenceAssembly, checked_assembly, checked_diagnostics
+from vibench.interfaces.validation import Fingerprint, ReferenceAssembly, checked_assembly
 from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.error_bounds import reference_bound
 from vibench.offline.assemblies import assemblies
@@ -24,6 +24,7 @@ from vibench.offline.reduction import check_skipped
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.qp.scaling import nearby
+from vibench.signatures import refuse_others, rule_of
 from vibench.stages.artefacts import History, Store, storable
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.study.cells import Axes
@@ -213,7 +214,9 @@ class SnapshotStage(Stage):
     def _diagnostics(self, problem: Problem, mus: Array, first: int) -> tuple[History, ...]:
         by_quantity: dict[str, list[float]] = {}
         for mu in mus:
-            for quantity, value in checked_diagnostics(problem, mu).items():
+            found = problem.diagnostics(mu)
+            refuse_others(f"what `diagnostics` returned at mu = {mu.tolist()}", found, rule_of(Mapping[str, float]))
+            for quantity, value in found.items():
                 by_quantity.setdefault(quantity, []).append(float(value))
         return tuple(History.of(self.parameters.role, name, values, first) for name, values in by_quantity.items())
 
