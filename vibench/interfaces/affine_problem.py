@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, real_matrix, real_vector
-from vibench.errors import NumericalError, placed
+from vibench.errors import NumericalError
 from vibench.interfaces.affine import AffineSum, Theta, Thetas
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.signatures import bordered
@@ -63,8 +63,10 @@ class AffineProblem(Problem):
             given["dirichlet_lift"] = dirichlet_lift
         sums: dict[str, AffineSum] = {}
         for name, member in given.items():
-            with placed(name, NumericalError):
+            try:
                 sums[name] = self._sum(member)
+            except NumericalError as error:
+                raise NumericalError(f"{name}: {error}") from None
         # With `free` the members are declared for all unknowns, before Dirichlet conditions.
         N = n if free is None else int(np.shape(sums["A"].terms[0])[0])
         if free is not None and (len(free) != n or np.max(free, initial=-1) >= N):

@@ -247,9 +247,7 @@ def contradictions(problem: Problem, mu: Array, vi: VariationalInequality, *, el
     found = [(f"`affine` of {name}", name, *_sum(problem, name, mu, v, present)) for name in problem.affine]
     if elements and problem.elementwise:
         found += [(f"`element_sampler` of {name}", name, *sums) for name, sums in _integrated(problem, mu, v).items()]
-    if dofs is not None and not problem.has_contact:
-        found += [("`contact_dofs`, B", "B", vi.B[:, dofs] @ v[dofs], 0.0)]
-    elif dofs is not None:
+    if dofs is not None and problem.has_contact:
         contact, count = checked_contact(problem, mu), len(dofs)
         bounds = taken(contact.g, "g of `contact`", len(vi.g))
         found += [("`contact`, B", "B", contact.B @ v[dofs], 0.0)]
