@@ -5,15 +5,33 @@ algorithms and figures are in the submodules of `GROUPS`. A name is imported whe
 `import vibench` alone costs next to nothing.
 """
 
+import sys
+from collections.abc import Callable
 from importlib import import_module
-from types import FunctionType
+from inspect import isfunction
 
 import lazy_loader
 
 GROUPS = ("calibration", "linalg", "packs", "qp", "reduction", "report", "stability")
 """Submodules with public names of their own."""
 
-_attached, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+def surface(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
+    """`__getattr__`, `__dir__` and `__all__` of a package by its stub; its functions check their arguments."""
+    attached, listed, names = lazy_loader.attach_stub(package, file)
+
+    def found(name: str) -> object:
+        value = attached(name)
+        # Queries of plugins call `is_absent`: a check would take longer.
+        if isfunction(value) and name != "is_absent":
+            value = import_module("vibench.signatures").public(value, package)
+            setattr(sys.modules[package], name, value)
+        return value
+
+    return found, listed, names
+
+
+_found, __dir__, __all__ = surface(__name__, __file__)
 
 
 def __getattr__(name: str) -> object:
@@ -26,8 +44,4 @@ def __getattr__(name: str) -> object:
         for group in GROUPS:
             if name in import_module(f"vibench.{group}").__all__:
                 raise ImportError(f"'{name}' is in vibench.{group}: from vibench.{group} import {name}")
-    found = _attached(name)
-    # Queries of plugins call `is_absent`: a check would take longer.
-    if isinstance(found, FunctionType) and name != "is_absent":
-        globals()[name] = found = import_module("vibench.signatures").public(found, __name__)
-    return found
+    return _found(name)

@@ -19,6 +19,7 @@ from .errors import NumericalError as NumericalError
 from .errors import RequestError as RequestError
 from .errors import UnsupportedError as UnsupportedError
 from .errors import VibenchError as VibenchError
+from .errors import foreign as foreign
 from .highfidelity.active_set import HighFidelitySolution as HighFidelitySolution
 from .highfidelity.active_set import HighFidelitySolver as HighFidelitySolver
 from .highfidelity.active_set import solve_high_fidelity as solve_high_fidelity

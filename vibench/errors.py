@@ -57,14 +57,14 @@ def _text_of(error: BaseException) -> str:
 
 
 @contextmanager
-def foreign(what: str) -> Iterator[None]:
-    """Turn whatever the import, compilation or load of `what` raises in the block into an `UnsupportedError`."""
+def foreign(what: str, kind: type[VibenchError] = UnsupportedError) -> Iterator[None]:
+    """Turn whatever the code of others raises in the block into an error of a kind that says `what` this is."""
     try:
         yield
     except (VibenchError, MemoryError):
         raise
     except (Exception, SystemExit) as error:  # noqa: BLE001  the code of others raises anything
-        raise UnsupportedError(f"{what} cannot be used: {in_a_line(error)}") from None
+        raise kind(f"{what}: {in_a_line(error)}") from None
 
 
 @contextmanager

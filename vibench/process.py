@@ -2,53 +2,84 @@
 
 from __future__ import annotations
 
+import builtins
+import contextlib
 import locale
 import os
 import random
+import resource
 import signal
 import sys
+import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 
-@contextmanager
-def put_back() -> Iterator[list[str]]:
-    """Put back what the block changes in this process; at its end the list has the names of that."""
-    before, changed = _state(), list[str]()
+@contextlib.contextmanager
+def put_back() -> Iterator[dict[str, bool]]:
+    """Put back what the block changes in this process; at its end there are the names of that, and if it is back."""
+    before, changed = [(name, read, write, read()) for name, (read, write) in _parts().items()], dict[str, bool]()
+    modules = dict(sys.modules)
     try:
         yield changed
     finally:
-        changed += [name for name, (value, _) in _state().items() if value != before[name][0]]
-        for value, back in map(before.__getitem__, changed):
-            back(value)
+        for name, read, write, value in before:
+            if read() != value:
+                # Limits may go one way alone, and a library may have a handler that Python cannot set.
+                with contextlib.suppress(OSError, ValueError, TypeError):
+                    write(value)
+                changed[name] = read() == value
+        if lost := {name: one for name, one in modules.items() if sys.modules.get(name) is not one}:
+            sys.modules.update(lost)
+            changed["sys.modules"] = True
 
 
-def _state() -> dict[str, tuple[Any, Callable[[Any], object]]]:
-    """The state as it is now, and how every part is put back."""
-    name, key, *rest = np.random.get_state()  # noqa: NPY002  plugins may use it
-    left = signal.getitimer(signal.ITIMER_REAL)[0]
-    ends = left and round(time.monotonic() + left, -2)
-    handlers = {number: signal.getsignal(number) for number in signal.valid_signals()}
+def _parts() -> dict[str, tuple[Callable[[], Any], Callable[[Any], object]]]:
+    """How every part of the state is read and put back; those come first that reading the others needs."""
+    owned = {sys: ("path", "meta_path", "path_hooks", "stdin", "stdout", "stderr"), warnings: ("filters",)}
     return {
-        "sys.path": (sys.path[:], lambda known: setattr(sys, "path", known)),
-        "the recursion limit": (sys.getrecursionlimit(), sys.setrecursionlimit),
-        "numpy.seterr": (np.geterr(), lambda known: np.seterr(**known)),
-        "warnings.filters": (warnings.filters[:], lambda known: setattr(warnings, "filters", known)),
-        "the working directory": (_folder(), os.chdir),
-        "the environment": (os.environ.copy(), _set_environment),
-        "the state of random": (random.getstate(), random.setstate),
-        "the state of numpy.random": ((name, np.asarray(key).tolist(), *rest), np.random.set_state),
-        "the handlers of signals": (handlers, _set_handlers),
+        "the recursion limit": (sys.getrecursionlimit, sys.setrecursionlimit),
+        "builtins": (builtins.__dict__.copy, builtins.__dict__.update),
+        "sys.settrace": (sys.gettrace, sys.settrace), "sys.setprofile": (sys.getprofile, sys.setprofile),
+        **{
+            f"{owner.__name__}.{name}": (partial(_copy, owner, name), partial(setattr, owner, name))
+            for owner, names in owned.items()
+            for name in names
+        },
+        "numpy.seterr": (np.geterr, lambda known: np.seterr(**known)),
+        **{
+            f"the limit {name}": (partial(resource.getrlimit, one), partial(resource.setrlimit, one))
+            for name, one in vars(resource).items()
+            if name.startswith("RLIMIT_")
+        },
+        "the umask": (_umask, os.umask),
+        "the working directory": (_folder, os.chdir), "the environment": (os.environ.copy, _set_environment),
+        "the folder of temporary files": (tempfile.gettempdir, partial(setattr, tempfile, "tempdir")),
+        "the state of random": (random.getstate, random.setstate),
+        "the state of numpy.random": (_numpy_random, np.random.set_state),
+        **{f"the handler of {one}": (partial(signal.getsignal, one), partial(signal.signal, one))
+           for one in signal.valid_signals()},
         # A timer that goes off later ends the work of others.
-        "the timer": (ends, lambda known: signal.setitimer(signal.ITIMER_REAL, known and known - time.monotonic())),
-        "the locale": (locale.setlocale(locale.LC_ALL), lambda known: locale.setlocale(locale.LC_ALL, known)),
-    }
+        **{f"the timer {one}": (partial(_ends, one), partial(_set_timer, one)) for one in range(3)},
+        "the locale": (partial(locale.setlocale, locale.LC_ALL), partial(locale.setlocale, locale.LC_ALL)),
+    }  # fmt: skip
+
+
+def _copy(owner: Any, name: str) -> Any:
+    value = getattr(owner, name)
+    return value[:] if isinstance(value, list) else value
+
+
+def _umask() -> int:
+    # It cannot be read without being set.
+    os.umask(mask := os.umask(0o077))
+    return mask
 
 
 def _folder() -> str:
@@ -63,8 +94,20 @@ def _set_environment(known: Mapping[str, str]) -> None:
     os.environ.update(known)
 
 
-def _set_handlers(known: Mapping[signal.Signals, Any]) -> None:
-    for number, handler in known.items():
-        # `None` stands for a handler of a library, which Python cannot set.
-        if handler is not None and signal.getsignal(number) is not handler:
-            signal.signal(number, handler)
+def _numpy_random() -> tuple[Any, ...]:
+    name, key, *rest = np.random.get_state()  # noqa: NPY002  plugins may use it
+    return (name, np.asarray(key).tolist(), *rest)
+
+
+def _now(timer: int) -> float:
+    return time.monotonic() if timer == signal.ITIMER_REAL else time.process_time()
+
+
+def _ends(timer: int) -> float:
+    """When a timer goes off, in hundreds of seconds; 0 if never."""
+    left = signal.getitimer(timer)[0]
+    return left and round(_now(timer) + left, -2)
+
+
+def _set_timer(timer: int, ends: float) -> None:
+    signal.setitimer(timer, ends and max(ends - _now(timer), 1.0))

@@ -12,13 +12,13 @@ import sys
 import types
 import typing
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral, Real
 from typing import Annotated, Any, TypeVar, cast, get_args, get_origin
 
 import numpy as np
 
-from vibench.errors import RequestError, unknown_name
+from vibench.errors import RequestError, VibenchError, unknown_name
 from vibench.text import shown
 
 T = TypeVar("T")
@@ -70,13 +70,14 @@ def bordered(called: F, owner: type | None = None, declared: Callable[..., Any] 
     return cast(F, call)
 
 
-def overridden(kind: type, module: str) -> None:
+def overridden(kind: type, module: str, *unchecked: str) -> None:
     """Check the arguments of methods of a class by the annotations of those in a module that they override."""
-    bases = [vars(base) for base in kind.__mro__[1:] if base.__module__ == module]
+    bases = [base for base in kind.__mro__[1:] if base.__module__ == module]
     for name, member in list(vars(kind).items()) if kind.__module__ != module else ():
-        declared = next((base[name] for base in bases if name in base and name[0] != "_"), None)
+        owner = next((base for base in bases if name in vars(base) and name[0] != "_"), None)
+        declared = None if owner is None or name in unchecked else vars(owner)[name]
         if isinstance(member, types.FunctionType) and isinstance(declared, types.FunctionType):
-            setattr(kind, name, bordered(member, declared=declared))
+            setattr(kind, name, bordered(member, owner, declared))
 
 
 def inside(method: F) -> F:
@@ -93,7 +94,9 @@ def constructed(kind: type[T]) -> type[T]:
 @functools.cache
 def public(function: Callable[..., Any], module: str) -> Callable[..., Any]:
     """The `bordered` function as one of a module, by which it is pickled; vibench itself calls the function."""
-    call: Callable[..., Any] = bordered(inspect.unwrap(function))
+    inner = inspect.unwrap(function)
+    # What a context manager wraps is a generator, and no context.
+    call: Callable[..., Any] = bordered(function if inspect.isgeneratorfunction(inner) else inner)
     call.__module__ = module
     return call
 
@@ -106,14 +109,16 @@ class _Signature:
         # Annotations of results may be names for the type checker alone.
         hinted = {name: hint for name, hint in declared.__annotations__.items() if name != "return"}
         given = types.SimpleNamespace(__annotations__=hinted)
-        hints = typing.get_type_hints(given, declared.__globals__, include_extras=True)
+        hints = typing.get_type_hints(given, inspect.unwrap(declared).__globals__, include_extras=True)
         parameters = self._signature.parameters.values()
         self._several = any(one.kind in (one.VAR_POSITIONAL, one.VAR_KEYWORD) for one in parameters)
         several = [one.name for one in parameters if one.kind is one.VAR_POSITIONAL and one.name in hints]
         hints |= {name: types.GenericAlias(tuple, (hints[name], ...)) for name in several}
         self._rules = {one.name: (rule_of(hints.get(one.name, Any)), one.default) for one in parameters}
         if owner is not None:
-            self._rules["self"] = rule_of(owner), None
+            # A constructor may call what overrides a method before all parts of the object are there.
+            rule = rule_of(owner)
+            self._rules["self"] = rule if declared is function else replace(rule, holds=lambda _: True), None
         self._positional = [one.name for one in parameters if one.kind < one.VAR_POSITIONAL]
         self._required = {one.name for one in parameters if one.default is one.empty}
 
@@ -144,18 +149,30 @@ class _Signature:
             raise RequestError(f"{self._title}: {error}") from None
 
 
-def refuse_others(what: str, value: Any, rule: Rule) -> None:
-    """Raise a `RequestError` that names a value for which a rule does not hold."""
+def refuse_others(what: str, value: Any, rule: Rule, error: type[VibenchError] = RequestError) -> None:
+    """Raise an error that names a value for which a rule does not hold."""
     if rule.holds(value):
         return
     if all(hasattr(value, name) for name, _ in rule.parts):
         for name, inner in rule.parts:
-            refuse_others(f"{name} in {what}", getattr(value, name), inner)
+            refuse_others(f"{name} in {what}", getattr(value, name), inner, error)
     if rule.axes and is_plain(value) and not _has_axes(value, rule.axes):
-        raise RequestError(f"{what} has the shape {value.shape}, expected {rule.right}")
+        raise error(f"{what} has the shape {value.shape}, expected {rule.right}")
     if rule.axes and is_plain(value) and value.dtype.kind == "f" and len(wrong := np.argwhere(~np.isfinite(value))):
-        raise RequestError(f"{what} has an entry that is not finite, first at {wrong[0].tolist()}")
-    raise RequestError(f"{what} is {shown(value)}, expected {rule.right}")
+        raise error(f"{what} has an entry that is not finite, first at {wrong[0].tolist()}")
+    raise error(f"{what} is {shown(value)}, expected {rule.right}")
+
+
+def check_attributes(made: Any, base: type, error: type[VibenchError] = RequestError) -> None:
+    """Raise an error if an attribute of an object of a plugin is not what the annotations of a class say."""
+    for name, rule in _attributes(base).items():
+        refuse_others(f"`{name}` of {type(made).__name__}", getattr(made, name, None), rule, error)
+
+
+@functools.cache
+def _attributes(base: type) -> dict[str, Rule]:
+    hints = typing.get_type_hints(base, include_extras=True).items()
+    return {name: rule_of(get_args(hint)[0] if get_origin(hint) is typing.ClassVar else hint) for name, hint in hints}
 
 
 @functools.cache
@@ -193,6 +210,8 @@ def _rule_of_items(origin: Any, parts: tuple[Any, ...]) -> Rule:
             np.float64: ("fiu", "finite numbers"), np.intp: ("iu", "indices"), np.bool_: ("b", "truth values"),
         }[get_args(parts[1])[0]]  # fmt: skip
         return Rule(f"an array of {what}", lambda value: is_plain(value) and _is_finite(value, kinds))
+    if origin is type:
+        return Rule(f"a subclass of {parts[0].__name__}", lambda v: isinstance(v, type) and issubclass(v, parts[0]))
     # Types of a tuple of some length are not looked at.
     if not (isinstance(origin, type) and issubclass(origin, Collection)) or (origin is tuple and ... not in parts):
         return Rule("a function", callable) if origin is Callable else _rule_of_class(origin)
@@ -256,4 +275,4 @@ def _sizes(name: str, value: Any, rule: Rule) -> Iterator[tuple[str, int, str]]:
         pairs = zip(reversed(rule.axes), reversed(shape), strict=False)
         yield from ((axis, count, name) for axis, count in pairs if axis != "…")
     for part, inner in rule.parts if value is not None else ():
-        yield from _sizes(f"{part} in {name}", getattr(value, part), inner)
+        yield from _sizes(f"{part} in {name}", getattr(value, part, None), inner)

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge, Lt
 
-from vibench import Array, Cone, DualStrategy, InnerProduct, NumericalError, Stop, UnsupportedError, no_free
+from vibench import Array, Cone, DualStrategy, InnerProduct, NumericalError, Stop, foreign, no_free
 from vibench.linalg import singular_values
 from vibench.reduction import refuse_negative
 from vibench_strategies.snapshot_cones import normalised, projection_errors
@@ -26,11 +26,9 @@ class NonnegativeFactors(DualStrategy):
 
     def __init__(self, seed: Annotated[int, Ge(0), Lt(2**32)] = 0, iterations: Annotated[int, Ge(1)] = 1000) -> None:
         # Imported here, since scikit-learn is optional, and not in `reduce`, whose seconds count.
-        try:
+        with foreign("scikit-learn cannot be used"):
             from sklearn.decomposition import NMF  # noqa: PLC0415
             from sklearn.exceptions import ConvergenceWarning  # noqa: PLC0415
-        except Exception as error:  # noqa: BLE001  a broken library raises anything
-            raise UnsupportedError(f"scikit-learn cannot be used: {type(error).__name__}: {error}") from None
 
         self.seed, self.iterations = seed, iterations
         self._factorisation, self._not_converged = NMF, ConvergenceWarning

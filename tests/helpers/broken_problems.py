@@ -69,10 +69,7 @@ _variant, _changed, _built = (partial(make, __name__) for make in (variant, chan
 Asymmetric = _changed("Asymmetric", "A", lambda A, mu, _: A + sp.csr_array(([1e-3 * mu[0]], ([2], [3])), shape=A.shape))
 Indefinite = _changed("Indefinite", "A", lambda A, mu, wire: A - 4.0 * (mu[0] - 4.0) * Wire().mass / 0.9)
 InfiniteMatrix = _changed("InfiniteMatrix", "B", lambda B, mu, wire: B + sp.csr_array(([np.inf], ([5], [5])), B.shape))
-Integers = _changed("Integers", "g", lambda g, mu, wire: np.zeros(len(g), dtype=int))
 Column = _changed("Column", "f", lambda f, mu, wire: f[:, None])
-Dense = _changed("Dense", "A", lambda A, mu, wire: A.toarray())
-RowList = _changed("RowList", "B", lambda B, mu, wire: B.tolil())
 # The support gives way by a hundredth above a force of 5.4321 N/m.
 Jumps = _changed("Jumps", "g", lambda g, mu, wire: 1.01 * g, above=5.4321)
 # At one force alone it is another wire.

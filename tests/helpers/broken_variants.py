@@ -249,12 +249,6 @@ def ignores_the_bounds(program: VariationalInequality, accuracy: float) -> QPSol
     return QPSolution(np.linalg.solve(program.A, program.f), np.zeros(len(program.g)), "solved")
 
 
-def overwrites(program: VariationalInequality, accuracy: float) -> QPSolution:
-    found = exact(program, accuracy)
-    program.g[:] += 1.0
-    return found
-
-
 def draws(program: VariationalInequality, accuracy: float) -> QPSolution:
     found = exact(program, accuracy)
     return replace(found, x=found.x + 1e-5 * np.random.default_rng().random(len(found.x)))

@@ -96,9 +96,9 @@ BUILD: Acts = {
     "training": ("error: another one since: training_set", lambda o: setattr(o.problem, "training_set", throw)),
 }
 MODEL: Acts = {
-    "true": ("error: `dimension` of the model is True", lambda made: setattr(made, "dimension", True)),
-    "nan": ("error: `generators` of the model is nan", lambda made: setattr(made, "generators", np.nan)),
-    "less": ("error: `enrichment` of the model is -5", lambda made: setattr(made, "enrichment", -5)),
+    "true": ("error: `dimension` of HostileModel is True", lambda made: setattr(made, "dimension", True)),
+    "nan": ("error: `generators` of HostileModel is nan", lambda made: setattr(made, "generators", np.nan)),
+    "less": ("error: `enrichment` of HostileModel is -5", lambda made: setattr(made, "enrichment", -5)),
     "more": ("error: `enrichment` of the model is 99, more", lambda made: setattr(made, "enrichment", 99)),
 }
 TRIVIAL = VariationalInequality(np.eye(1), np.zeros(1), np.zeros((1, 1)), np.zeros(1))

@@ -73,7 +73,7 @@ class Metropolis:
 
 def arviz() -> Any:
     """The package ArviZ; an `UnsupportedError` if it is not installed."""
-    with foreign("the package arviz, of the extra 'calibration',"), warnings.catch_warnings():
+    with foreign("the package arviz, of the extra 'calibration', cannot be used"), warnings.catch_warnings():
         # It announces its next version whenever it is imported.
         warnings.simplefilter("ignore", FutureWarning)
         import arviz  # noqa: PLC0415  an extra

@@ -25,7 +25,7 @@ def minimise(
 
     Raises an `UnsupportedError` if the package `cma` is not installed.
     """
-    with foreign("the package cma, of the extra 'calibration',"):
+    with foreign("the package cma, of the extra 'calibration', cannot be used"):
         import cma  # noqa: PLC0415  an extra
     # Criteria that look at values are switched off: ranks are no values. A seed of 0 means the clock.
     ignored = dict.fromkeys(("tolfun", "tolfunhist"), 0.0) | dict.fromkeys(("tolflatfitness", "tolstagnation"), np.inf)

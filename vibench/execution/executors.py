@@ -15,7 +15,7 @@ from queue import SimpleQueue
 from typing import Any, TypeAlias
 
 from vibench import interrupts
-from vibench.errors import ExecutorError, RequestError, in_a_line
+from vibench.errors import ExecutorError, RequestError, foreign, in_a_line
 from vibench.execution.supervisor import Job, Supervisor, code_here
 from vibench.provenance import machine
 from vibench.qp.status import Status
@@ -93,15 +93,13 @@ class Dask(Executor):
     """
 
     def __init__(self, scheduler: str | None, slots: int, store: Path) -> None:
-        try:
+        needs = "the executor 'dask' needs dask.distributed and cryptography, of vibench's extra 'cluster'"
+        with foreign(needs, RequestError):
             from distributed import Client, LocalCluster  # noqa: PLC0415  an optional dependency
             from distributed.security import Security  # noqa: PLC0415
 
             # Anybody who can connect to a scheduler can run code on its workers: keep out other users of this machine.
             own = Security.temporary() if scheduler is None else None
-        except (Exception, SystemExit) as error:  # noqa: BLE001  a broken library raises anything
-            needs = f"the executor 'dask' needs dask.distributed and cryptography ({in_a_line(error)})"
-            raise RequestError(f"{needs}: install vibench with its extra 'cluster'") from None
         credentials = Security().get_connection_args("client")
         if scheduler is not None and is_authenticated(scheduler) and credentials["ssl_context"] is None:
             raise RequestError(f"the scheduler '{scheduler}' asks for credentials: set distributed.comm.tls of dask")
@@ -111,18 +109,13 @@ class Dask(Executor):
         self._token = secrets.token_hex(8)
         self._cluster: Any = None
         if scheduler is None:
-            try:
-                with interrupts.held():
-                    self._cluster = LocalCluster(
-                        n_workers=slots, threads_per_worker=1, processes=True, host="127.0.0.1", protocol="tls",
-                        security=own, dashboard_address="127.0.0.1:0", memory_limit=0, silence_logs="CRITICAL",
-                    )  # fmt: skip
-            except Exception as error:  # noqa: BLE001  what dask preloads may raise anything
-                raise RequestError(f"dask cannot start its workers: {in_a_line(error)}") from None
-        try:
+            with foreign("dask cannot start its workers", RequestError), interrupts.held():
+                self._cluster = LocalCluster(
+                    n_workers=slots, threads_per_worker=1, processes=True, host="127.0.0.1", protocol="tls",
+                    security=own, dashboard_address="127.0.0.1:0", memory_limit=0, silence_logs="CRITICAL",
+                )  # fmt: skip
+        with foreign(f"no dask scheduler answers at '{scheduler}'", RequestError):
             self._client = Client(self._cluster or scheduler, timeout="10s", set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise RequestError(f"no dask scheduler answers at '{scheduler}': {error}") from None
         self.slots, self.machines = self._check_workers(store)
 
     def _check_workers(self, store: Path) -> tuple[int, frozenset[str]]:
@@ -130,9 +123,8 @@ class Dask(Executor):
         token = store / f"{self._token}.part"
         token.touch()
         try:
-            workers: dict[str, tuple[bool, str, str]] = self._client.run(_describe, str(token))
-        except Exception as error:  # noqa: BLE001  a worker without vibench may raise anything
-            raise RequestError(f"the dask workers cannot run vibench: {in_a_line(error)}") from None
+            with foreign("the dask workers cannot run vibench", RequestError):
+                workers: dict[str, tuple[bool, str, str]] = self._client.run(_describe, str(token))
         finally:
             token.unlink()
         if not workers:

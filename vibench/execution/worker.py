@@ -181,7 +181,8 @@ def _guarded(job: Job, work: Callable[[], T]) -> T | Failed:
     with put_back() as changed:
         outcome = _outcome(job.memory_gib, work)
     # Threads cannot be put back.
-    if isinstance(outcome, Failed) or not threads.issuperset(threading.enumerate()):
+    whole = all(changed.values()) and threads.issuperset(threading.enumerate())
+    if isinstance(outcome, Failed) or not whole:
         _failed.append(job.stage.key)
     if isinstance(outcome, Failed) and changed:
         return Failed(outcome.status, f"{outcome.reason}; before that it changed {', '.join(changed)}")

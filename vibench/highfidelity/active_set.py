@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.arrays import Array, Indices, Mask, SparseMatrix, read_only
 from vibench.errors import NumericalError, at_parameter
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness, condensed_stiffness
 from vibench.interfaces.dual_sets import BlockKind, DualSet, refuse_blocks
@@ -24,7 +24,8 @@ from vibench.qp import verification
 from vibench.qp.exact import Directions, least_distance_solution, rows_that_matter
 from vibench.qp.scaling import peak, ratio, row_norms
 from vibench.qp.solve import solve_qp
-from vibench.signatures import bordered, constructed
+from vibench.signatures import bordered, constructed, rule_of
+from vibench.text import one_line, shown
 
 Iterated = tuple[Array, Array, int]  # u (n,), λ (m,) and the number of linear systems
 # Largest natural residual of a snapshot (`vibench.qp.verification`).
@@ -114,14 +115,14 @@ class HighFidelitySolver:
                 stiffness.check_definite(name)
                 self._coercive = stiffness if "A" in self._problem.constant else None
             solution = verified(vi, stiffness, unverified)
-            if reason := self._problem.refuse(mu, solution.u, solution.lam):
-                raise NumericalError(reason)
+            if reason := self._problem.refuse(mu, read_only(solution.u), read_only(solution.lam)):
+                raise NumericalError(one_line(str(reason)))
             return solution
 
     def remember(self, mu: Array, solution: ActiveSetSolution) -> None:
         """Let later solutions start from the contact set of this one, at mu (d,)."""
         self._solved.append(mu)
-        self._active.append(self._problem.K.free(solution.lam))
+        self._active.append(read_only(self._problem.K.free(solution.lam)))
 
     def forget(self) -> None:
         """Forget all solutions, so that no later one starts from them; factorisations stay."""
@@ -141,9 +142,8 @@ class HighFidelitySolver:
             # Remember nothing there: the start must depend on the parameter alone.
             coarse = self._coarse.solve_assembled(mu, checked_assembly(start.coarse, mu))
             return start.coarse.K.free(coarse.lam)[start.nearest]
-        if start is not None and (np.shape(start) != (m,) or np.asarray(start).dtype != bool):
-            got = f"the shape {np.shape(start)} and the type {np.asarray(start).dtype}"
-            raise NumericalError(f"start returns an array of {got}; expected ({m},) and bool, a NestedStart, or None")
+        if start is not None and not (rule_of(Mask).holds(start) and start.shape == (m,)):
+            raise NumericalError(f"start returns {shown(start)}; expected truth values ({m},), a NestedStart, or None")
         return start
 
     def condensed(self, vi: VariationalInequality) -> CondensedStiffness:

@@ -29,7 +29,7 @@ from vibench.errors import RequestError
 from vibench.interfaces.dual_sets import BlockKind
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, PrimalStrategy, Stop
-from vibench.signatures import bordered
+from vibench.signatures import Count, bordered
 from vibench.text import shown
 
 # The layers above define these classes; nothing here imports them.
@@ -215,11 +215,11 @@ class FormulationModel(ABC):
     A query must not depend on those before it, and what is timed is repeated at parameters next to the queries' own.
     """
 
-    dimension: int
+    dimension: Count
     """Largest number N' of coefficients of u in a query."""
-    generators: int | None = None
+    generators: Count | None = None
     """Largest number R of coefficients of λ in a query; `None` where λ has none."""
-    enrichment: int | None = None
+    enrichment: Count | None = None
     """How many of the coefficients of u are not of V_N, where it is not the enrichment of the offline phase."""
     fallbacks: tuple[str, ...] = ()
     """One line for every step that deviates from the algorithm."""

@@ -41,6 +41,8 @@ class ParameterBox:
         # Problems share their box with all plugins.
         for name in ("lower", "upper"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
+        if len({*map(normal_name, self.names)} - {""}) < self.dim:
+            raise RequestError(f"names of ParameterBox are {', '.join(self.names)}, expected different ones")
         if (self.lower > self.upper).any():
             raise RequestError(f"lower bounds {self.lower.tolist()} are above the upper ones {self.upper.tolist()}")
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
@@ -23,7 +23,7 @@ from vibench.interfaces.outputs import MeshFields, Output, Picture
 from vibench.interfaces.parameters import ParameterBox
 from vibench.linalg.factorisations import DEFAULT
 from vibench.linalg.inner_product import InnerProduct
-from vibench.signatures import Rule, bordered
+from vibench.signatures import Count, Rule, Seed, bordered, overridden
 
 
 @dataclass(frozen=True)
@@ -125,6 +125,10 @@ class ContactLoads:
 MEMBERS = ("A", "f", "B", "g")
 """The members of a `VariationalInequality` that depend on the parameter."""
 
+OfBox: TypeAlias = Annotated[Array, "d"]
+OfV: TypeAlias = Annotated[Array, "n"]
+OfW: TypeAlias = Annotated[Array, "m"]
+
 Sampler = Callable[[Array], Mapping[str, Array]]
 """From a parameter mu (d,) to the values of chosen entries, by member."""
 
@@ -136,7 +140,7 @@ class Problem(ABC):
     immutable once built, and `assemble` depends on nothing but the parameter.
     """
 
-    parameters: ParameterBox
+    parameters: Annotated[ParameterBox, "d"]
     """Names, bounds and units of the parameters."""
     V: Annotated[InnerProduct, "n"]
     """Inner product of the primal space, X_V (n×n), independent of the parameter."""
@@ -144,16 +148,16 @@ class Problem(ABC):
     """Inner product of the multiplier space, X_W (m×m), in a basis whose nonnegative coefficients are the cone W⁺."""
     K: DualSet = RAYS
     """The set of the multipliers, which every assembly has; it does not depend on mu."""
-    constant: ClassVar[frozenset[str]] = frozenset()
+    constant: ClassVar[Set[str]] = frozenset()
     """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu."""
     affine: Mapping[str, AffineSum] = MappingProxyType({})
     """Members that are sums Σ_q θ_q(mu) · terms_q, by name; reduced assembly projects the terms and is exact.
 
     `affine["A"].terms` and `affine["A"].coefficients(mu)` are the terms and θ(mu), as for bounds of the coercivity.
     """
-    entrywise: ClassVar[frozenset[str]] = frozenset()
+    entrywise: ClassVar[Set[str]] = frozenset()
     """Members that `sampler` evaluates entry by entry."""
-    elementwise: ClassVar[frozenset[str]] = frozenset()
+    elementwise: ClassVar[Set[str]] = frozenset()
     """Members, "A" and "f" or one of them, that `element_sampler` integrates element by element."""
     licence: str = ""
     """Licence of the data that the problem is made of, "unknown" if it is; "" where that of its distribution holds."""
@@ -161,6 +165,11 @@ class Problem(ABC):
     """Who factorises A and eliminates unknowns of X_V: the option that every problem has, set by `factorised_by`."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
+
+    def __init_subclass__(cls, **named: Any) -> None:
+        super().__init_subclass__(**named)
+        # Queries call `contact`: a check would take longer.
+        overridden(cls, __name__, "contact")
 
     @classmethod
     def data_digest(cls, **options: Any) -> str:  # noqa: ARG003
@@ -180,12 +189,12 @@ class Problem(ABC):
     def training_set(self) -> Array:
         """Parameters (P×d) the reduced model is trained on."""
 
-    def validation_set(self, count: int, seed: int) -> Array:
+    def validation_set(self, count: Count, seed: Seed) -> Array:
         """Parameters (count×d) the reduced model is validated on; uniformly random in the box by default."""
         return self.parameters.sample(count, seed)
 
     @abstractmethod
-    def assemble(self, mu: Array) -> VariationalInequality:
+    def assemble(self, mu: OfBox) -> VariationalInequality:
         """High-fidelity matrices and vectors at the parameter mu (d,)."""
 
     @property
@@ -206,7 +215,8 @@ class Problem(ABC):
         """Whether the problem defines `contact_dofs` and `contact`."""
         return self.contact_dofs is not None and type(self).contact is not Problem.contact
 
-    def contact_loads(self, eta: Array) -> ContactLoads:
+    @bordered
+    def contact_loads(self, eta: Annotated[Array, "m", "k"]) -> ContactLoads:
         """Bᵀη on `contact_dofs` and ηᵀg for multipliers η (m×k), from `contact` where nothing cheaper is known.
 
         Queries of reduced models evaluate these at every parameter, for few multipliers: a problem that knows which
@@ -245,7 +255,8 @@ class Problem(ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} declares {sorted(self.elementwise)} and has no elements")
 
-    def constraint(self, mu: Array) -> tuple[SparseMatrix, Array]:
+    @bordered
+    def constraint(self, mu: OfBox) -> tuple[SparseMatrix, Array]:
         """B (m×n) and g (m,) at mu (d,), from `contact` if implemented, else from `assemble`."""
         with at_parameter(mu):
             contact = self.contact(mu)
@@ -258,7 +269,7 @@ class Problem(ABC):
         entries = (B.data, self.contact_dofs[B.indices], B.indptr)
         return sp.csr_array(entries, shape=(B.shape[0], self.V.dim)), contact.g
 
-    def start(self, mu: Array, nearest: Mask | None) -> Mask | NestedStart | None:  # noqa: ARG002
+    def start(self, mu: OfBox, nearest: Annotated[Mask, "m"] | None) -> Mask | NestedStart | None:  # noqa: ARG002
         """Initial active set (m,) of the high-fidelity solver at mu (d,); `None` for an empty one.
 
         Solutions do not depend on it. By default it is the contact set of the nearest parameter solved so far, `None`
@@ -274,7 +285,7 @@ class Problem(ABC):
         """
         return self.W.apply(np.ones(self.W.dim))
 
-    def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
+    def refuse(self, mu: OfBox, u: OfV, lam: OfW) -> str:  # noqa: ARG002
         """Why a high-fidelity solution u (n,), λ (m,) at mu (d,) is outside the scope of the model; "" if it is not."""
         return ""
 
@@ -283,16 +294,16 @@ class Problem(ABC):
         """Quantities of interest, whose errors are recorded; none by default."""
         return ()
 
-    def picture(self, mu: Array, u: Array, lam: Array) -> Picture | None:  # noqa: ARG002
+    def picture(self, mu: OfBox, u: OfV, lam: OfW) -> Picture | None:  # noqa: ARG002
         """The picture of a solution u (n,), λ (m,) at mu (d,); `None` if not implemented."""
         return None
 
-    def mesh_fields(self, mu: Array, u: Array, lam: Array) -> MeshFields | None:
+    def mesh_fields(self, mu: OfBox, u: OfV, lam: OfW) -> MeshFields | None:
         """A solution u (n,), λ (m,) at mu (d,) on its mesh, for programs that show meshes; by default its picture."""
         picture = self.picture(mu, u, lam)
         return None if picture is None else MeshFields.of_picture(picture)
 
-    def diagnostics(self, mu: Array) -> Mapping[str, float]:  # noqa: ARG002
+    def diagnostics(self, mu: OfBox) -> Mapping[str, float]:  # noqa: ARG002
         """Scalars recorded with a high-fidelity solution at mu (d,), such as mesh quality; none by default."""
         return {}
 

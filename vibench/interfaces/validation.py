@@ -6,20 +6,23 @@ Declarations of a problem are believed only until the assembly at a parameter re
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Annotated, Any
 
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, Mask, real_matrix, real_vector, taken
-from vibench.errors import NumericalError, RequestError, at_parameter
+from vibench.arrays import Array, Indices, Mask, read_only, real_matrix, real_vector, taken
+from vibench.errors import NumericalError, at_parameter, placed
 from vibench.interfaces.absent_rows import ABSENT, is_absent, settled_bounds
 from vibench.interfaces.dual_sets import RAYS, DualSet
-from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
+from vibench.interfaces.outputs import Output, Picture
+from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, Sampling, check_sample
 from vibench.linalg.inner_product import InnerProduct
+from vibench.signatures import check_attributes, refuse_others, rule_of
 
 
 def check_cone(cone: object, W: InnerProduct, K: DualSet = RAYS) -> Cone:
@@ -79,25 +82,31 @@ def training_parameters(problem: Problem, sampling: Sampling | None = None) -> A
     """The training set (P×d), by default the problem's; refused if it is no set of parameters of the box."""
     if sampling is not None:
         return check_sample(problem.parameters, sampling.parameters(problem.parameters))
-    try:
+    with placed("training_set"):
         return check_sample(problem.parameters, problem.training_set())
-    except RequestError as error:
-        raise NumericalError(f"training_set: {error}") from None
 
 
 def validation_parameters(problem: Problem, count: int, seed: int, sampling: Sampling | None = None) -> Array:
     """The validation set (count×d), by default the problem's; refused if it has the wrong shape or is not finite."""
     if sampling is not None:
         return check_sample(problem.parameters, sampling.parameters(problem.parameters))
-    return taken(np.asarray(problem.validation_set(count, seed)), "`validation_set`", count, problem.parameters.dim)
+    box = problem.parameters
+    mus = taken(np.asanyarray(problem.validation_set(count, seed)), "`validation_set`", count, box.dim)
+    for k, i in np.argwhere(box.outside(mus))[:1]:
+        where = f"'{box.names[i]}' outside [{box.lower[i]:g}, {box.upper[i]:g}]"
+        raise NumericalError(f"validation_set leaves the box: parameter {k}, {mus[k].tolist()}, has {where}")
+    return mus
 
 
 def in_float64(vi: VariationalInequality) -> VariationalInequality:
     """The same with sparse matrices and vectors of float64; raises a `NumericalError` for what has no such form."""
+    if not isinstance(vi, VariationalInequality):
+        raise NumericalError(f"`assemble` returned a {type(vi).__name__}, expected a VariationalInequality")
     A, B, f, g = real_matrix(vi.A, "A"), real_matrix(vi.B, "B"), real_vector(vi.f, "f"), real_vector(vi.g, "g")
-    if A is vi.A and B is vi.B and f is vi.f and g is vi.g:
+    lift = None if vi.dirichlet_lift is None else real_vector(vi.dirichlet_lift, "dirichlet_lift")
+    if A is vi.A and B is vi.B and f is vi.f and g is vi.g and lift is vi.dirichlet_lift:
         return vi
-    return VariationalInequality(A, f, B, g, vi.dirichlet_lift, vi.K)
+    return VariationalInequality(A, f, B, g, lift, vi.K)
 
 
 def settled(vi: VariationalInequality) -> VariationalInequality:
@@ -171,8 +180,8 @@ def fingerprint(problem: Problem, mu: Array, vi: VariationalInequality) -> Finge
     """The fingerprint of `vi`, the assembly at mu (d,), of the `contact` there, and of the inner products."""
     arrays, box = {name: getattr(vi, name) for name in MEMBERS}, problem.parameters
     arrays |= {"X_V": problem.V.matrix, "X_W": problem.W.matrix, "the box": np.append(box.lower, box.upper)}
-    if problem.has_contact and (contact := problem.contact(mu.copy())) is not None:
-        arrays["B of `contact`"] = contact.B
+    if problem.has_contact:
+        arrays["B of `contact`"] = checked_contact(problem, read_only(mu)).B
     return _fingerprint(arrays)
 
 
@@ -192,47 +201,102 @@ def _probed(array: Any) -> Array:
     return np.asarray(array @ (1.0 + np.random.default_rng(0).random(array.shape[1])))
 
 
+def check_declarations(problem: Problem) -> None:
+    """Raise an error if what a problem is declared to have, as by its annotations, is something else."""
+    check_attributes(problem, Problem, NumericalError)
+    hints: dict[str, Any] = {"outputs": Sequence[Output], "contact_dofs": Annotated[Indices, "k"] | None}
+    hints |= {"element_dofs": Annotated[Indices, "k", "e"]} if problem.elementwise else {}
+    for name, hint in hints.items():
+        refuse_others(f"`{name}` of the problem", getattr(problem, name), rule_of(hint), NumericalError)
+    members = {"constant": MEMBERS, "affine": MEMBERS, "entrywise": MEMBERS, "elementwise": ("A", "f")}
+    for name, known in members.items():
+        for other in sorted(set(getattr(problem, name)) - set(known)):
+            raise NumericalError(f"`{name}` names '{other}', expected members among {', '.join(known)}")
+    for one, again in combinations(problem.outputs, 2):
+        if one.name == again.name:
+            raise NumericalError(f"two outputs have the same name: {one.name}")
+    integrals = taken(problem.multiplier_integrals(), "`multiplier_integrals`", problem.W.dim)
+    for k in np.flatnonzero(integrals <= 0.0)[:1]:
+        expected = "expected positive integrals: override the method if the basis does not sum to one"
+        raise NumericalError(f"`multiplier_integrals` is {integrals[k]:.2g} at entry {k}; {expected}")
+    for name in ("contact_dofs", "element_dofs")[: 1 + bool(problem.elementwise)]:
+        # An unknown that is prescribed has the number -1 in an element.
+        dofs, least = getattr(problem, name), -1 if name == "element_dofs" else 0
+        if dofs is not None and dofs.size and not least <= dofs.min() <= dofs.max() < problem.V.dim:
+            expected = f"expected unknowns from {least} to {problem.V.dim - 1}"
+            raise NumericalError(f"`{name}` ranges from {dofs.min()} to {dofs.max()}, {expected}")
+        if dofs is not None and not least and np.any(np.diff(dofs.astype(np.int64)) <= 0):
+            raise NumericalError("`contact_dofs` is not strictly increasing")
+
+
+def checked_picture(problem: Problem, mu: Array, u: Array, lam: Array) -> Picture | None:
+    """`problem.picture` of a solution, into which it cannot write; a `NumericalError` if it is no picture of λ."""
+    picture = problem.picture(read_only(mu), read_only(u), read_only(lam))
+    refuse_others("what `picture` returned", picture, rule_of(Picture | None), NumericalError)
+    if picture is not None and picture.multiplier.shape != lam.shape:
+        raise NumericalError(f"picture.multiplier has shape {picture.multiplier.shape}; expected {lam.shape}")
+    return picture
+
+
+def checked_contact(problem: Problem, mu: Array) -> Contact:
+    """`problem.contact(mu)` of a problem that has some; a `NumericalError` if it is none, or of another size."""
+    assert problem.contact_dofs is not None  # implied by `has_contact`
+    contact, shape = problem.contact(mu), (problem.W.dim, len(problem.contact_dofs))
+    if not isinstance(contact, Contact) or contact.B.shape != shape:
+        what = f"B of shape {contact.B.shape}" if isinstance(contact, Contact) else f"the type {type(contact).__name__}"
+        raise NumericalError(f"what `contact` returned has {what}, expected a Contact with B of shape {shape}")
+    return contact
+
+
 def contradictions(problem: Problem, mu: Array, vi: VariationalInequality, *, elements: bool = True) -> Iterator[str]:
     """Differences of declarations from `vi`, the assembly at mu (d,): the declaration, the member and how much.
 
     Matrices are compared by their products with a random vector, which hides no entry. `elements` tells whether members
     declared `elementwise` are integrated, which takes as long as an assembly.
     """
-    rng = np.random.default_rng(0)
-    v = 1.0 + rng.random(len(vi.f))
-    present = ~is_absent(vi.g)
+    # Whoever writes into it says so by an error at that line.
+    mu, rng, n, dofs = read_only(mu), np.random.default_rng(0), len(vi.f), problem.contact_dofs
+    v, present = 1.0 + rng.random(n), ~is_absent(vi.g)
     products = {"A": vi.A @ v, "f": vi.f, "B": vi.B @ v, "g": np.where(present, vi.g, 0.0)}
     found = [(f"`affine` of {name}", name, *_sum(problem, name, mu, v, present)) for name in problem.affine]
     if elements and problem.elementwise:
         found += [(f"`element_sampler` of {name}", name, *sums) for name, sums in _integrated(problem, mu, v).items()]
-    if problem.has_contact and (contact := problem.contact(mu.copy())) is not None:
-        dofs = problem.contact_dofs
+    if dofs is not None and problem.has_contact:
+        contact, count = checked_contact(problem, mu), len(dofs)
+        bounds = taken(contact.g, "g of `contact`", len(vi.g))
         found += [("`contact`, B", "B", contact.B @ v[dofs], 0.0)]
-        found += [("`contact`, g", "g", np.where(is_absent(contact.g) & ~present, 0.0, contact.g), 0.0)]
+        found += [("`contact`, g", "g", np.where(is_absent(bounds) & ~present, 0.0, bounds), 0.0)]
         if type(problem).contact_loads is not Problem.contact_loads:
             eta = rng.random((len(vi.g), 2)) * present[:, None]
-            loads, bounds = problem.contact_loads(eta).at(mu.copy())
+            made = problem.contact_loads(eta)
+            if len(made.varying(mu)[0]) > made.reached.stop - made.first:
+                raise NumericalError(f"`contact_loads` vary on more rows at mu = {mu.tolist()} than their `reach`")
+            loads, of_bounds = made.at(mu)
             products |= {"Bᵀη": (vi.B.T @ eta)[dofs], "ηᵀg": eta.T @ products["g"]}
-            found += [("`contact_loads`, Bᵀη", "Bᵀη", loads, 0.0), ("`contact_loads`, ηᵀg", "ηᵀg", bounds, 0.0)]
+            found += [("`contact_loads`, Bᵀη", "Bᵀη", taken(loads, "Bᵀη of `contact_loads`", count, 2), 0.0)]
+            found += [("`contact_loads`, ηᵀg", "ηᵀg", taken(of_bounds, "ηᵀg of `contact_loads`", 2), 0.0)]
     for what, member, declared, scale in found:
         yield from _difference(what, products[member], declared, scale)
     yield from _sampled(problem, mu, vi, rng)
 
 
-def _difference(what: str, assembled: Array, declared: Array, scale: float) -> Iterator[str]:
+def _difference(
+    what: str, assembled: Array, declared: Array, scale: float, rows: Indices | None = None
+) -> Iterator[str]:
     """The sentence that they differ by more than round-off of their entries, or of terms of this size."""
     size = max(float(np.max(np.abs(assembled), initial=0.0)), scale)
     gap = np.abs(assembled - declared)
     # Negated, so that what is no number differs, too.
     if not np.max(gap, initial=0.0) <= 1e-9 * size:
         place = np.unravel_index(int(np.argmax(np.where(np.isnan(gap), np.inf, gap))), gap.shape)
-        yield f"{what}, is not that of `assemble`: row {int(place[0])} differs by {np.max(gap) / (size or 1.0):.1e}"
+        row = place[0] if rows is None else rows[place[0]]
+        yield f"{what}, is not that of `assemble`: row {row} differs by {np.max(gap) / (size or 1.0):.1e}"
 
 
 def _sum(problem: Problem, name: str, mu: Array, v: Array, present: Mask) -> tuple[Array, float]:
     """The declared sum of a member, or its product with v (n,), and the size of its terms."""
     declared = problem.affine[name]
-    theta = declared.coefficients(mu.copy())
+    theta = declared.coefficients(mu)
     terms = [np.where(present, term, 0.0) if name == "g" else term @ v if name in "AB" else term
              for term in declared.terms]  # fmt: skip
     parts = [np.asarray(value * term, dtype=float) for value, term in zip(theta, terms, strict=True)]
@@ -241,16 +305,19 @@ def _sum(problem: Problem, name: str, mu: Array, v: Array, present: Mask) -> tup
 
 def _integrated(problem: Problem, mu: Array, v: Array) -> dict[str, tuple[Array, float]]:
     """Members summed over all elements, matrices times v (n,)."""
-    dofs = problem.element_dofs
-    known = dofs >= 0
-    values = problem.element_sampler(np.arange(dofs.shape[1]))(mu.copy())
-    local = np.where(known, v[dofs], 0.0)
-    found = dict[str, tuple[Array, float]]()
-    for name in sorted(problem.elementwise):
-        parts = np.einsum("jab,bj->aj", values[name], local) if name == "A" else np.asarray(values[name]).T
-        total = np.asarray(np.bincount(dofs[known], weights=parts[known], minlength=len(v)), float)
-        found[name] = total, float(np.max(np.abs(parts), initial=0.0))
-    return found
+    dofs, v = problem.element_dofs, np.append(v, 0.0)
+    found = {name: (np.zeros(len(v)), 0.0) for name in sorted(problem.elementwise)}
+    # Every other element, so that a sampler which ignores the choice is found.
+    for chosen in (np.arange(first, dofs.shape[1], 2) for first in (0, 1)):
+        values, own = problem.element_sampler(chosen)(mu), dofs[:, chosen]
+        for name, (total, scale) in found.items():
+            size = (len(dofs),) * (2 if name == "A" else 1)
+            parts = taken(values.get(name), f"{name} of `element_sampler`", len(chosen), *size)
+            # Prescribed values, at -1, count as zeros.
+            parts = np.einsum("jab,bj->aj", parts, v[own]) if name == "A" else parts.T
+            added = np.bincount(own.ravel() % len(v), weights=parts.ravel(), minlength=len(v))
+            found[name] = total + added, max(scale, float(np.max(np.abs(parts), initial=0.0)))
+    return {name: (total[:-1], scale) for name, (total, scale) in found.items()}
 
 
 def _sampled(problem: Problem, mu: Array, vi: VariationalInequality, rng: np.random.Generator) -> Iterator[str]:
@@ -259,12 +326,13 @@ def _sampled(problem: Problem, mu: Array, vi: VariationalInequality, rng: np.ran
     wanted, expected = dict[str, tuple[Indices, Indices]](), dict[str, Array]()
     for name, member in members.items():
         rows, columns, values = _entries(member)
-        chosen = rng.choice(len(values), min(32, len(values)), replace=False) if len(values) else np.zeros(0, np.intp)
+        chosen = np.sort(rng.permutation(len(values))[:32])
         wanted[name], expected[name] = (rows[chosen], columns[chosen]), values[chosen]
-    samples = problem.sampler(wanted)(mu.copy()) if wanted else {}
+    samples = problem.sampler(wanted)(mu) if wanted else {}
     for name, values in expected.items():
         scale = float(np.max(np.abs(_entries(members[name])[2]), initial=0.0))
-        yield from _difference(f"`sampler` of {name}", values, np.asarray(samples[name]), scale)
+        sampled = taken(samples.get(name), f"{name} of `sampler`", len(values))
+        yield from _difference(f"`sampler` of {name}", values, sampled, scale, wanted[name][0])
 
 
 def _entries(member: Any) -> tuple[Indices, Indices, Array]:
@@ -280,8 +348,10 @@ class ReferenceAssembly:
     """The `first_assembly` of a problem, as this returned it; assemblies at other parameters are compared with it."""
 
     def __init__(self, problem: Problem) -> None:
+        check_declarations(problem)
         (mu, self._vi), self._problem, self._compared = first_assembly(problem), problem, 0
-        self.fingerprint = fingerprint(problem, mu, self._vi)
+        with at_parameter(mu):
+            self.fingerprint = fingerprint(problem, mu, self._vi)
 
     def refuse_false_declarations(self, mu: Array, vi: VariationalInequality) -> None:
         """Raise a `NumericalError` if a declaration, such as `constant`, `affine` or `contact`, differs from `vi`."""
@@ -292,7 +362,9 @@ class ReferenceAssembly:
             raise NumericalError(f"a member declared `constant` depends on mu: {deviation} {where}")
         # Integration over all elements takes as long as an assembly: a few parameters of a chunk have to do.
         self._compared += 1
-        for difference in contradictions(self._problem, mu, vi, elements=self._compared <= 4):
+        with at_parameter(mu):
+            difference = next(contradictions(self._problem, mu, vi, elements=self._compared <= 4), "")
+        if difference:
             raise NumericalError(f"refuted at mu = {mu.tolist()}: {difference}")
 
     def refuse_at_random(self, count: int, seed: int) -> None:

@@ -46,7 +46,7 @@ def fmu(source: str, arrays: Mapping[str, Array], about: Mapping[str, Any], stem
         "certified": int(certified), "corrected": corrected, "output_count": len(outputs), "values": len(variables),
     })  # fmt: skip
     # The program may run on another processor than this one.
-    with foreign("the C compiler"), scratch() as folder:
+    with foreign("the C compiler cannot be used"), scratch() as folder:
         binary = compiled(source, folder, native=False).read_bytes()
     platform, end = ("darwin64", "dylib") if sys.platform == "darwin" else ("linux64", "so")
     contents = {

@@ -45,7 +45,7 @@ class Implementation(ABC):
     def fault(self) -> str:
         """Reason why its module cannot be imported; "" if it can."""
         try:
-            with foreign(f"the factorisation '{self.name}'"):
+            with foreign(f"the factorisation '{self.name}' cannot be used"):
                 import_module(self.module)
         except UnsupportedError as error:
             return str(error)

@@ -245,7 +245,7 @@ def why_indefinite(matrix: SparseMatrix) -> str:
     return f"it is singular, {motion} in its kernel: {why}; prescribe such motions, or add a weak foundation"
 
 
-def svd(a: Array) -> tuple[Array, Array, Array]:
+def svd(a: Annotated[Array, "n", "l"]) -> tuple[Array, Array, Array]:
     """Thin singular value decomposition a = (u·s) vᵀ: u (n×k), s (k,) falling, vᵀ (k×l).
 
     By QR iteration (LAPACK's gesvd): the divide-and-conquer routine behind `numpy.linalg.svd` was seen not to converge
@@ -255,14 +255,14 @@ def svd(a: Array) -> tuple[Array, Array, Array]:
     return np.asarray(u), np.asarray(s), np.asarray(vt)
 
 
-def singular_values(a: Array) -> Array:
+def singular_values(a: Annotated[Array, "n", "l"]) -> Array:
     """Singular values of `a`, falling; by the same routine as `svd`."""
     if not a.size:
         return np.zeros(0)
     return np.asarray(scipy.linalg.svd(a, compute_uv=False, lapack_driver="gesvd"))
 
 
-def orthonormal_range(y: Array, against: Array | None = None) -> Array:
+def orthonormal_range(y: Annotated[Array, "n", "k"], against: Annotated[Array, "n", "l"] | None = None) -> Array:
     """Euclidean orthonormal basis of the columns of y (n×k), with orthonormal columns `against` (n×l) projected out.
 
     The basis is (n×r), r the numerical rank at `RANK_RTOL` by pivoted QR.
@@ -282,7 +282,7 @@ def orthonormal_range(y: Array, against: Array | None = None) -> Array:
     return np.asarray(q)
 
 
-def project_out(space: Array, y: Array) -> Array:
+def project_out(space: Annotated[Array, "n", "l"], y: Array) -> Array:
     """The part (I − Π)y of y (n,) or (n×k) for orthonormal columns `space` (n×l); applied twice against round-off."""
     for _ in range(2):
         y = y - space @ (space.T @ y)

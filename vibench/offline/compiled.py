@@ -120,7 +120,7 @@ class CompiledProgram:
 
     def __init__(self, source: str, unknowns: int, constraints: int) -> None:
         # A library that is loaded needs its file no longer.
-        with foreign("the C compiler, or what it makes,"), scratch() as folder:
+        with foreign("the C compiler, or what it makes, cannot be used"), scratch() as folder:
             self._solve = ctypes.CDLL(str(compiled(source, folder))).model_solve_counting
         self._sizes = unknowns, constraints
         self._solve.argtypes, self._solve.restype = [ctypes.c_void_p] * 5, ctypes.c_int

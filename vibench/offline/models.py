@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
 
 import numpy as np
 
+from vibench import signatures
 from vibench.arrays import Array, is_sound, read_only, taken
 from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
@@ -171,12 +172,10 @@ class Model:
         made = self.formulation.model(self.offline, self.built)
         if not isinstance(made, FormulationModel):
             raise NumericalError(f"the formulation made a {type(made).__name__}, expected a FormulationModel")
-        dimension, added = getattr(made, "dimension", None), made.enrichment or 0
-        for name, size in (("dimension", dimension), ("generators", made.generators or 0), ("enrichment", added)):
-            if not (rule := rule_of(Count)).holds(size):
-                raise NumericalError(f"`{name}` of the model is {shown(size)}, expected {rule.right}")
-        if added > made.dimension:
-            raise NumericalError(f"`enrichment` of the model is {shown(added)}, more than its `dimension`, {dimension}")
+        signatures.check_attributes(made, FormulationModel, NumericalError)
+        if (added := made.enrichment or 0) > made.dimension:
+            what = f"`enrichment` of the model is {added}, more than its `dimension`"
+            raise NumericalError(f"{what}, {made.dimension}")
         if self.formulation.has_program and not hasattr(made, "reduced"):
             raise NumericalError("the formulation declares `has_program`, but its model has no `reduced`")
         return made
@@ -495,9 +494,8 @@ def _numbers(name: str, value: Any, expected: str) -> Array:
 
 def check_built(built: object) -> Mapping[str, Any]:
     """Return what a formulation has built, or refuse what is no mapping with texts as names."""
-    if not isinstance(built, Mapping) or not all(isinstance(name, str) for name in built):
-        raise NumericalError(f"`build` returned a {type(built).__name__}, expected a mapping whose names are texts")
-    return built
+    signatures.refuse_others("what `build` returned", built, rule_of(Mapping[str, Any]), NumericalError)
+    return cast("Mapping[str, Any]", built)
 
 
 def _taken(answer: object, model: FormulationModel) -> FormulationAnswer:
@@ -512,8 +510,7 @@ def _taken(answer: object, model: FormulationModel) -> FormulationAnswer:
             raise NumericalError(f"{name} of the answer has {len(value)} coefficients, the model declares {most}")
     kinds = {"outcome": formulations.Outcome, "reason": str, "iterations": Count | None}
     for name, kind in (kinds | {"uncertainty": NotNegative | None}).items():
-        if not (rule := rule_of(kind)).holds(value := getattr(answer, name)):
-            raise NumericalError(f"{name} of the answer is {shown(value)}, expected {rule.right}")
+        signatures.refuse_others(f"{name} of the answer", getattr(answer, name), rule_of(kind), NumericalError)
     return replace(answer, x=vectors["x"], alpha=vectors["alpha"])
 
 

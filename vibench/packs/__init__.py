@@ -1,5 +1,5 @@
 """Model packs: folders of matrices from any code; their format, what they hold, its checks, and writing them."""
 
-import lazy_loader
+from vibench import surface
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = surface(__name__, __file__)

@@ -9,9 +9,7 @@ import io
 import math
 import resource
 import stat
-import struct
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
@@ -21,7 +19,7 @@ import scipy.io
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.errors import RequestError, in_a_line, message_of, placed, unknown_name
+from vibench.errors import RequestError, foreign, placed, unknown_name
 from vibench.provenance import memory
 
 
@@ -108,15 +106,9 @@ class ArrayFiles:
 
     @contextlib.contextmanager
     def _reading(self, reference: str, what: str) -> Iterator[None]:
-        try:
-            with placed(what):
-                yield
-        # NumPy, SciPy, zipfile and h5py raise these for damaged files.
-        except (
-            OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, NotImplementedError, RuntimeError,
-            SyntaxError, struct.error, zipfile.BadZipFile, zlib.error, MemoryError,
-        ) as error:  # fmt: skip
-            raise RequestError(f"{what}: '{reference}' is damaged: {message_of(error)}") from None
+        # NumPy, SciPy, zipfile and h5py raise anything for damaged files.
+        with foreign(f"{what}: '{reference}' is damaged", RequestError), placed(what):
+            yield
 
     def _read(self, reference: str) -> Any:
         """A dense array, or the arrays of a sparse matrix by name, or a matrix."""
@@ -160,10 +152,11 @@ class ArrayFiles:
         first = np.lib.format.read_magic(file) == (1, 0)
         read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = read_header(file)
-        if dtype.hasobject:
-            raise RequestError("it holds Python objects (a pickle), which are not loaded; save numbers")
-        if dtype.kind not in "biufcS":
-            raise RequestError(f"it holds values of type {dtype}; expected numbers")
+        if dtype.hasobject or dtype.kind not in "biufcS":
+            objects = "Python objects (a pickle), which are not loaded"
+            raise RequestError(
+                f"it holds {objects if dtype.hasobject else f'values of type {dtype}'}; expected numbers"
+            )
         if min(shape, default=0) < 0:
             raise RequestError(f"its shape {size_of(shape)} is negative: it is damaged")
         count = math.prod(map(int, shape))
@@ -198,10 +191,8 @@ class ArrayFiles:
         return np.asarray(matrix) if layout == "array" else _checked(sp.csr_array(matrix))
 
     def _hdf5(self, path: Path, inner: str) -> Any:
-        try:
+        with foreign("HDF5 files need h5py (pip install 'vibench[hdf5]')", RequestError):
             import h5py  # noqa: PLC0415  optional
-        except (Exception, SystemExit) as error:  # noqa: BLE001  a broken library raises anything
-            raise RequestError(f"HDF5 files need h5py ({in_a_line(error)}): pip install 'vibench[hdf5]'") from None
         with h5py.File(path, "r") as file:
             node: Any = file
             for part in [part for part in inner.split("/") if part]:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, get_type_hints
 
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
-from vibench.errors import RequestError, in_a_line, unknown_name
+from vibench.errors import RequestError, foreign, in_a_line, unknown_name
 from vibench.text import shown
 
 
@@ -84,10 +84,8 @@ def options_of(plugin: Any) -> Mapping[str, Option]:
     constructor = inspect.getattr_static(plugin, "__init__")
     if constructor is object.__init__:
         return {}
-    try:
+    with foreign(f"the options of {plugin.__name__} have annotations that fail", RequestError):
         hints = get_type_hints(constructor, include_extras=True)
-    except Exception as error:  # noqa: BLE001  evaluating annotations runs third-party code
-        raise RequestError(f"the options of {plugin.__name__} have annotations that fail: {in_a_line(error)}") from None
     # The first parameter is self.
     parameters = list(inspect.signature(constructor).parameters.values())[1:]
     named = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]

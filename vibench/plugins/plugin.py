@@ -19,7 +19,7 @@ from typing import Any
 
 import cloudpickle
 
-from vibench.errors import RequestError, in_a_line, message_of
+from vibench.errors import RequestError, foreign, message_of
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.options import named_path, options_as_json
 from vibench.plugins.reads import states
@@ -121,10 +121,8 @@ class GivenPlugin(RegisteredPlugin):
         if not self.pickled:
             given = f"the {self} is a class or an object that a study was given in another process"
             raise RequestError(f"{given}, or before it was edited: run the study again with what it is now")
-        try:
+        with foreign(f"the {self} cannot be received by a worker process", RequestError):
             return cloudpickle.loads(self.pickled)
-        except Exception as error:  # noqa: BLE001  importing it runs third-party code
-            raise RequestError(f"the {self} cannot be received by a worker process: {in_a_line(error)}") from None
 
     @property
     def is_class(self) -> bool:

@@ -11,6 +11,7 @@ import importlib.metadata
 import importlib.util
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.metadata import Distribution, EntryPoint
@@ -18,7 +19,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vibench.errors import RequestError, in_a_line, unknown_name
+from vibench.errors import RequestError, foreign, in_a_line, unknown_name
 from vibench.plugins.kinds import PluginKind
 from vibench.provenance import distribution_version, package_hash, solver_version
 
@@ -116,10 +117,8 @@ class RegisteredPlugin:
     def load(self) -> Any:
         """The object that its entry point refers to."""
         where = f"{self} ({self._entry.value})"
-        try:
+        with foreign(f"{where} cannot be loaded", RequestError):
             plugin = self._entry.load()
-        except (Exception, SystemExit) as error:  # noqa: BLE001  importing a plugin runs third-party code
-            raise RequestError(f"{where} cannot be loaded: {in_a_line(error)}") from None
         base = self.kind.base
         if base is not None and not (isinstance(plugin, type) and issubclass(plugin, base)):
             raise RequestError(f"{where} is not a subclass of {base.__qualname__}")
@@ -193,16 +192,18 @@ class RegisteredPlugin:
         return str(self.load().data_digest(**self._without_factorisation(self.check_options(options))[0]))
 
     def create(self, options: Mapping[str, Any]) -> Any:
-        """An instance; raises a `RequestError` if there is no such plugin, or it does not take these options."""
-        own, chosen = self._without_factorisation(self.check_options(options))
-        if not chosen:
-            return self.load()(**own)
+        """An instance; a `RequestError` if there is no such plugin, these are not its options, or it lacks a part."""
         from vibench.linalg.inner_product import factorised_later
+        from vibench.signatures import check_attributes
 
+        own, chosen = self._without_factorisation(self.check_options(options))
         # The constructor must not factorise X_V with the default first, which may take longest of all.
-        with factorised_later():
+        with factorised_later() if chosen else nullcontext():
             made = self.load()(**own)
-            made.factorised_by(chosen["factorisation"])
+            if chosen:
+                made.factorised_by(chosen["factorisation"])
+        if self.kind.base is not None:
+            check_attributes(made, self.kind.base)
         return made
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg.lapack import dposv, dpotrf, dtrtrs
 
-from vibench.arrays import Array, Mask
+from vibench.arrays import Array, Mask, taken
 from vibench.errors import NumericalError, UnsupportedError, foreign, in_a_line, message_of, unknown_name
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
@@ -186,8 +186,8 @@ def _or_its_error(solve: Callable[[], T]) -> T | QPSolution:
 def _report(answer: QPSolution, program: VariationalInequality) -> tuple[str, int | None]:
     """Status in one line, and iterations if they are a number of them; refuses vectors of wrong shapes."""
     for name, value, count in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):
-        if value is not None and value.shape != (count,):
-            raise NumericalError(f"the solver returned {name} of shape {value.shape}, expected ({count},)")
+        if value is not None:
+            taken(value, f"{name} of the solver", count, finite=False)
     status, steps = answer.solver_status, answer.iterations
     if not isinstance(status, str):
         raise NumericalError(f"the solver reports the status {status!r:.40}; expected a text")
@@ -298,7 +298,7 @@ def load_qpsolvers() -> tuple[Any, Mapping[str, str]]:
         if (within or {}).get("__name__") != "qpsolvers.solvers":
             return usual(name, within, *given, **named)
         try:
-            with foreign(name):
+            with foreign(f"{name} cannot be used"):
                 return usual(name, within, *given, **named)
         except UnsupportedError as error:
             faults[name.removesuffix("_")] = str(error)
@@ -307,7 +307,7 @@ def load_qpsolvers() -> tuple[Any, Mapping[str, str]]:
 
     builtins.__import__ = importing  # type: ignore[assignment]
     try:
-        with foreign("qpsolvers"):
+        with foreign("qpsolvers cannot be used"):
             import qpsolvers  # noqa: PLC0415  loads every solver there is, which processes that use none need not
     finally:
         builtins.__import__ = usual

@@ -1,5 +1,5 @@
 """Reduced bases: POD, projection on cones, supremizers, nested enrichments, lazy greedy selection, cubatures."""
 
-import lazy_loader
+from vibench import surface
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = surface(__name__, __file__)

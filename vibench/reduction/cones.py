@@ -15,6 +15,7 @@ from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Cone, Stop, no_free, rays
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
+from vibench.signatures import constructed
 
 # A snapshot whose relative distance from the cone is below this is reproduced up to round-off.
 REPRODUCED = 1e-12
@@ -131,6 +132,7 @@ def _project_whitened(generators: Array, theta: Array) -> Projection:
     return Projection(np.asarray(coefficients), float(distance))
 
 
+@constructed
 class GrowingCone:
     """A cone that grows by one generator at a time, and the snapshot that is farthest from it.
 
@@ -142,7 +144,7 @@ class GrowingCone:
     Raises a `NumericalError` if a snapshot θ_q (m×Q) has a negative coefficient: it would not be in W⁺.
     """
 
-    def __init__(self, snapshots: Array, W: InnerProduct) -> None:
+    def __init__(self, snapshots: Annotated[Array, "m", "Q"], W: Annotated[InnerProduct, "m"]) -> None:
         refuse_negative(snapshots)
         whitened = W.whiten(snapshots)
         self._W, self._norms = W, np.linalg.norm(whitened, axis=0)
@@ -203,6 +205,7 @@ def refuse_negative(snapshots: Array) -> None:
         raise NumericalError(f"a multiplier snapshot has the negative coefficient {snapshots.min():.1e}")
 
 
+@constructed
 class LazyDistances:
     """Largest distance of snapshots from a growing cone, relative to the largest norm, with few projections.
 
@@ -213,7 +216,7 @@ class LazyDistances:
     The snapshots (m×Q), not all zero, are `whitened`: in coordinates in which the norm is Euclidean.
     """
 
-    def __init__(self, whitened: Array) -> None:
+    def __init__(self, whitened: Annotated[Array, "m", "Q"]) -> None:
         self._snapshots = whitened
         norms = np.linalg.norm(whitened, axis=0)
         self._largest = float(norms.max())

@@ -6,15 +6,17 @@ import numpy as np
 import scipy.linalg
 
 from vibench.arrays import Array, Indices
+from vibench.signatures import Count, constructed
 
 
+@constructed
 class Cubature:
     """The conditions of a cubature, each with a random sign in one of few sums, which keep its residual.
 
     `size` conditions, N', are added at a time; the cubature chooses from `count` columns, e.
     """
 
-    def __init__(self, size: int, count: int) -> None:
+    def __init__(self, size: Count, count: Count) -> None:
         # Far more sums than a cubature has columns represent all conditions.
         self._sums, self._rng = np.zeros((max(800, 8 * size), count)), np.random.default_rng(0)
 

@@ -10,9 +10,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from vibench.arrays import Array
+from vibench.arrays import Array, taken
 from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.strategies import Enrichment, Kind, Offline, PrimalStrategy
+from vibench.signatures import refuse_others, rule_of
 from vibench.timing import Seconds, Stopwatch
 
 
@@ -96,10 +97,15 @@ def grow_through(strategy: NestedStrategy, offline: Offline, tolerances: Iterabl
                 raise
             return Grown(vectors, milestones, str(error))
         begun = True
+        what = f"what `steps` of {type(strategy).__name__} yielded"
+        refuse_others(what, step, rule_of(Step), NumericalError)
+        refuse_others(f"measure of {what}", step.measure, rule_of(float), NumericalError)
         meets = operator.ge if strategy.larger_is_tighter else operator.le
         passed = [tolerance for tolerance in ahead if meets(step.measure, tolerance)]
         if passed:
-            vectors = np.hstack([vectors, step.vectors(vectors.shape[1])])
+            known = vectors.shape[1]
+            added = taken(step.vectors(known), f"vectors of {what}", len(vectors), step.count - known)
+            vectors = np.hstack([vectors, added])
             history = {quantity: np.array(values) for quantity, values in step.history.items()}
             milestones |= dict.fromkeys(passed, Milestone(step.count, history, watch.seconds()))
             ahead = [tolerance for tolerance in ahead if tolerance not in milestones]

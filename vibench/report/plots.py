@@ -24,7 +24,7 @@ from vibench.results.break_even import HIGH_FIDELITY, TAIL
 from vibench.results.paired_timing import PairedTiming
 from vibench.text import printable
 
-with foreign("matplotlib"):
+with foreign("matplotlib cannot be used"):
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

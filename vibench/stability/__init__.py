@@ -1,5 +1,5 @@
 """Inf-sup constants over the span and the cone of reduced multipliers."""
 
-import lazy_loader
+from vibench import surface
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = surface(__name__, __file__)

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 from scipy.optimize import nnls
@@ -127,7 +128,7 @@ def _with_few_rows(projected: Array) -> Array:
     return projected if projected.shape[0] <= projected.shape[1] else np.asarray(np.linalg.qr(projected, mode="r"))
 
 
-def beta_span(on_span: Array) -> float:
+def beta_span(on_span: Annotated[Array, "N", "rank"]) -> float:
     """Smallest singular value of ZᵀBᵀ on an orthonormal basis of span χ (N'×rank); 0 exactly when N' < rank."""
     rows, rank = on_span.shape
     if not rank:

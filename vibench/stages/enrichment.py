@@ -91,7 +91,8 @@ class GrowthStage(Stage):
     def run(self, store: Store) -> Result:
         """An `AssessedGrowth`."""
         offline = _offline(store, self.pod, self.cone)
-        grown = grow_through(self.primal.create(), offline, self.tolerances)
+        with faults_of(self.primal):
+            grown = grow_through(self.primal.create(), replace(offline), self.tolerances)
         projected = _projected(offline, grown.vectors, value_of(store, self.cone.constraints))
         size = offline.basis.shape[1]
         training = {tolerance: projected.first(size + m.count).beta_span() for tolerance, m in grown.milestones.items()}

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from vibench.interfaces.outputs import Picture
+from vibench.interfaces.validation import checked_picture
 from vibench.plugins.plugin import Plugin
 from vibench.results.pictures import members
 from vibench.stages.artefacts import Store, storable
-from vibench.stages.base import Result, Stage, build_problem
+from vibench.stages.base import Result, Stage, build_problem, faults_of
 from vibench.stages.snapshots import gather, solution_stages
 from vibench.study.cells import Axes
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
@@ -46,7 +47,8 @@ class PictureStage(Stage):
         nearest = (int(np.argmin(np.linalg.norm(unit - corner, axis=1))) for corner in (0.0, 0.5, 1.0))
         # Few training parameters may be nearest to several of these: draw each once.
         for k in dict.fromkeys(nearest):
-            picture = problem.picture(solutions.mu[k], solutions.u[:, k], solutions.lam[:, k])
+            with faults_of(self.problem):
+                picture = checked_picture(problem, solutions.mu[k], solutions.u[:, k], solutions.lam[:, k])
             if picture is not None:
                 named = zip(box.names, solutions.mu[k], box.units, strict=True)
                 texts = (f"{name} = {mu:.3g}" + f" {unit}" * (unit not in ("", "1")) for name, mu, unit in named)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -24,6 +24,7 @@ from vibench.offline.reduction import check_skipped
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.qp.scaling import nearby
+from vibench.signatures import refuse_others, rule_of
 from vibench.stages.artefacts import History, Store, storable
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.study.cells import Axes
@@ -213,7 +214,9 @@ class SnapshotStage(Stage):
     def _diagnostics(self, problem: Problem, mus: Array, first: int) -> tuple[History, ...]:
         by_quantity: dict[str, list[float]] = {}
         for mu in mus:
-            for quantity, value in problem.diagnostics(mu).items():
+            found = problem.diagnostics(mu)
+            refuse_others(f"what `diagnostics` returned at mu = {mu.tolist()}", found, rule_of(Mapping[str, float]))
+            for quantity, value in found.items():
                 by_quantity.setdefault(quantity, []).append(float(value))
         return tuple(History.of(self.parameters.role, name, values, first) for name, values in by_quantity.items())
 

@@ -11,7 +11,7 @@ from typing import Literal, cast
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.errors import NumericalError, RequestError, in_a_line
+from vibench.errors import RequestError, VibenchError, foreign, placed
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import AdaptiveSampling, Sampling
 from vibench.interfaces.validation import training_parameters, validation_parameters
@@ -95,12 +95,8 @@ def _problem(plugin: Plugin) -> Problem:
 @contextmanager
 def _refused(who: str) -> Iterator[None]:
     """Turn what a plugin raises in the process of the command into a `RequestError`, and put back what it changes."""
-    try:
-        with put_back():
-            yield
-    except (Exception, SystemExit) as error:  # noqa: BLE001  plugins raise anything
-        told = isinstance(error, RequestError | NumericalError)
-        raise RequestError(f"{who}: {error if told else in_a_line(error)}") from None
+    with foreign(who, RequestError), placed(who, VibenchError), put_back():
+        yield
 
 
 @lru_cache(maxsize=64)

@@ -16,9 +16,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array
-from vibench.errors import NumericalError, in_a_line
+from vibench.errors import NumericalError, in_a_line, placed
 from vibench.execution.isolated import NotImportableError
 from vibench.plugins.options import Option, options_of
+from vibench.signatures import check_attributes
 from vibench.stages.artefacts import dumps, loads
 from vibench.testing.checks import SECONDS, Check, ConformanceError, Doubt, Note, call_in_other_process, kind_of
 from vibench.timing import timed
@@ -84,10 +85,11 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
         return result
 
     def construction(self) -> Iterator[str]:
-        """An instance of the right class can be made."""
+        """An instance of the right class can be made, whose attributes are what that annotates."""
         plugin: object = self.plugin
         if not isinstance(plugin, self.base):
             yield f"a {type(plugin).__name__} was made; expected a subclass of vibench.{self.base.__name__}"
+        check_attributes(plugin, self.base)
 
     @property
     def constructor_options(self) -> Mapping[str, Option]:
@@ -134,10 +136,8 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
             raise ConformanceError(f"the {type(self.plugin).__name__} cannot be pickled ({reason}){where}")
         # A run stores the results of all stages, and later processes read them.
         name, before = next(iter(self.results.items()))
-        try:
+        with placed(f"the {type(before).__name__} cannot be stored", NumericalError):
             after = self.stored(before)
-        except NumericalError as error:
-            raise ConformanceError(f"the {type(before).__name__} cannot be stored: {error}") from None
         for array, what in differences(self.arrays(after), self.arrays(before), 0.0):
             yield f"{name}: storing changes {array}: {what}"
         copy = pickle.loads(pickle.dumps(self.plugin))
@@ -212,32 +212,6 @@ def differences(one: Arrays, other: Arrays, rtol: float) -> Iterator[tuple[str, 
             yield name, "one of the two has none"
         elif what := difference(one[name], other[name], rtol * largest_entry(other[name])):
             yield name, what
-
-
-def unmutated(function: str, arrays: Arrays, call: Callable[[], T]) -> T:
-    """Result of a call; a `ConformanceError` names the arrays that it changed, and an entry of each."""
-    before = copies(arrays)
-    result = call()
-    if changed := [f"{name}: {what} before" for name, what in differences(copies(arrays), before, 0.0)]:
-        raise ConformanceError(f"{function} changes {'; '.join(changed)}; work on copies and return new arrays")
-    return result
-
-
-def array_fault(name: str, value: Any, shape: tuple[int, ...], *, sparse: bool = False) -> str:
-    """Why a value is not a finite float64 array of a shape, dense or sparse (CSR, CSC); "" if it is."""
-    if not (sp.issparse(value) if sparse else isinstance(value, np.ndarray)):
-        right = f"sparse CSR matrix: scipy.sparse.csr_array({name})" if sparse else f"NumPy array of shape {shape}"
-        return f"{name} is a {type(value).__name__}; expected a {right}"
-    if value.shape != shape:
-        return f"{name} has shape {value.shape}; expected {shape}"
-    if sparse and value.format not in ("csr", "csc"):
-        return f"{name} has the sparse format {value.format}; expected CSR or CSC: scipy.sparse.csr_array({name})"
-    if value.dtype != np.float64:
-        return f"{name} has dtype {value.dtype}; expected float64"
-    wrong = np.flatnonzero(~np.isfinite(_entries(value)))
-    if not len(wrong):
-        return ""
-    return f"{name} is not finite: entry {_place(value, wrong[0])} is {_entries(value)[wrong[0]]}"
 
 
 def at(mu: Array) -> str:

@@ -281,6 +281,9 @@ def raised(error: BaseException) -> str:
 def plugin_line(error: BaseException) -> str:
     """Return where an exception left the plugin, "cable.py, line 12: self.V = …"; "" if it did not pass through it."""
     libraries = [Path(str(module.__file__)).parent for module in (vibench, np, scipy)]
+    # Errors of vibench name what a plugin has raised.
+    while error.__cause__ is not None:
+        error = error.__cause__
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         file = Path(frame.filename)
         # Installed plugins lie below the standard library, in its folder of packages.

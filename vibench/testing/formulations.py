@@ -12,8 +12,8 @@ import numpy as np
 
 import vibench.stages.formulation  # noqa: F401  lists the classes that formulations may store
 from vibench.arrays import Array, read_only
-from vibench.errors import NumericalError, UnsupportedError, VibenchError
-from vibench.interfaces.formulations import Formulation, FormulationAnswer, Multiplier, OfflinePhase, Outcome, axes_of
+from vibench.errors import NumericalError, UnsupportedError, VibenchError, placed
+from vibench.interfaces.formulations import Formulation, FormulationAnswer, OfflinePhase, Outcome, axes_of
 from vibench.interfaces.strategies import Cone, no_free
 from vibench.model.errors import residual_multiplier
 from vibench.offline.assemblies import assemblies
@@ -99,15 +99,11 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         return result._replace(answer=replace(result.answer, **coefficients))
 
     def axes(self) -> Iterator[str]:
-        """`uses`, `multiplier` and `takes_start` are declared as they should be."""
-        plugin, uses = self.plugin, axes_of(self.plugin, type(self.plugin).__name__)
-        if not isinstance(plugin.multiplier, Multiplier):
-            yield f"multiplier is {plugin.multiplier!r}; expected a vibench.Multiplier"
-        if not isinstance(plugin.takes_start, bool):
-            yield f"takes_start is {plugin.takes_start!r}; expected True or False"
-        yield Note(f"uses {', '.join(uses) or 'no axis'}; λ is {plugin.multiplier}")
+        """The axes that `uses` declares are some."""
+        uses = axes_of(self.plugin, type(self.plugin).__name__)
+        yield Note(f"uses {', '.join(uses) or 'no axis'}; λ is {self.plugin.multiplier}")
 
-    def build(self) -> Iterator[str]:
+    def build(self) -> None:
         """`build` returns a mapping of what can be stored, or refuses the problem, as its cells in a study do."""
         try:
             built = check_built(self.plugin.build(self.phase(self.plugin)))
@@ -115,10 +111,8 @@ class FormulationCase(Case[Formulation, Array, Answered]):
             # A formulation may need more than the sample problem has; all later checks need this one.
             raise SkipTest(f"the formulation does not support the problem: {error}") from None
         for name, value in built.items():
-            try:
+            with placed(f"what `build` returns as '{name}' cannot be stored", NumericalError):
                 dumps(value)
-            except NumericalError as error:
-                yield f"what `build` returns as '{name}' cannot be stored: {error}"
 
     def model(self) -> None:
         """`model` makes a `FormulationModel` that says how many coefficients its answers have."""
@@ -145,11 +139,8 @@ class FormulationCase(Case[Formulation, Array, Answered]):
             answer, _ = of.answered(mu, settings)
             if answer.outcome is not Outcome.OK:
                 continue
-            try:
+            with placed(name, NumericalError):
                 found = of.status_of(mu, answer, solver, 1.0)
-            except NumericalError as error:
-                yield f"{name}: {error}"
-                continue
             if found.status is not Status.OK:
                 yield f"{name}: {found.reason}"
 

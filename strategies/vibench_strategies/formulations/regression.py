@@ -11,7 +11,7 @@ import scipy.linalg
 from annotated_types import Gt, Le
 from scipy.optimize import nnls
 
-from vibench import Array, Formulation, FormulationAnswer, FormulationModel, QuerySettings, UnsupportedError
+from vibench import Array, Formulation, FormulationAnswer, FormulationModel, QuerySettings, UnsupportedError, foreign
 from vibench_strategies.formulations.reduced_programs import FixedSpacesModel, refuse_free
 
 if TYPE_CHECKING:
@@ -77,12 +77,10 @@ class Regression(Formulation):
 
         Also K⁻¹ times the values, shifted and scaled (k×P), and the inverses of the Cholesky factors of K (k×P×P).
         """
-        try:
+        with foreign("scikit-learn cannot be used"):
             from sklearn.exceptions import ConvergenceWarning  # noqa: PLC0415  an extra
             from sklearn.gaussian_process import GaussianProcessRegressor  # noqa: PLC0415
             from sklearn.gaussian_process.kernels import ConstantKernel, Matern  # noqa: PLC0415
-        except Exception as error:  # noqa: BLE001  a broken library raises anything
-            raise UnsupportedError(f"scikit-learn cannot be used: {type(error).__name__}: {error}") from None
 
         means, spreads, (count, d) = values.mean(axis=1), values.std(axis=1), places.shape
         scaled = (values - means[:, None]) / np.where(spreads > 0.0, spreads, 1.0)[:, None]

@@ -46,7 +46,7 @@ class Strings(AffineProblem):
 
 def test_affine_declarations_pass_the_checks_or_are_named() -> None:
     check(Strings)
-    with pytest.raises(ConformanceError, match="affine sums: f of `affine` differs from that of `assemble`"):
+    with pytest.raises(ConformanceError, match="`affine` of f, is not that of `assemble`"):
         check(Wrong)
 
 

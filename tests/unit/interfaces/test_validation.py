@@ -1,5 +1,6 @@
 """Members of any unambiguous type are sparse matrices and vectors of float64 afterwards; others are named."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -13,13 +14,13 @@ from broken_variants import ByElements
 from fake_plugins import Wire
 from numerics import Varying
 
-from vibench import AffineProblem, Array, InnerProduct, ParameterBox, Reduction, VariationalInequality, create
-from vibench.errors import NumericalError
+from vibench import AffineProblem, Array, InnerProduct, Output, ParameterBox, Reduction, VariationalInequality, create
+from vibench.errors import NumericalError, RequestError
 from vibench.highfidelity.active_set import solve_high_fidelity
 from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.problem import Contact, ContactLoads, Problem
 from vibench.interfaces.strategies import Stop
-from vibench.interfaces.validation import ReferenceAssembly, checked_assembly, contradictions
+from vibench.interfaces.validation import ReferenceAssembly, checked_assembly, contradictions, validation_parameters
 
 MU = np.array([0.5])
 
@@ -199,6 +200,53 @@ def test_what_assembly_does_not_confirm_is_named_with_its_parameter(what: str) -
     reduction = Reduction(problem, None, None, None, None, assembly="reduced", bounds=between)
     with pytest.raises(NumericalError, match=r"refuted at mu = \[.*\]: `"):
         reduction.snapshots  # noqa: B018
+
+
+WIRE = Wire()
+RETURNS: dict[str, tuple[dict[str, Any], str]] = {
+    "members of a text": ({"constant": "Af"}, "`constant` of Variant is 'Af', expected a set of a text"),
+    "no members": ({"affine": None}, "`affine` of Variant is None, expected a mapping"),
+    "other members": ({"entrywise": {"X"}}, "`entrywise` names 'X', expected members among A, f, B, g"),
+    "no box": ({"parameters": [4.0, 8.0]}, "parameters in problem of Reduction is [4.0, 8.0], expected a"),
+    "no outputs": ({"outputs": None}, "`outputs` of the problem is None, expected a sequence of an Output"),
+    "two outputs": ({"outputs": [Output("x", "1", u=np.ones(12))] * 2}, "two outputs have the same name: x"),
+    "floats": ({"contact_dofs": np.arange(3.0)}, "`contact_dofs` of the problem is array([0., 1., 2.]), expected"),
+    "far": ({"contact_dofs": np.array([3, 12])}, "`contact_dofs` ranges from 3 to 12, expected unknowns from 0 to 11"),
+    "falling": ({"contact_dofs": np.array([3, 2], np.uint8)}, "`contact_dofs` is not strictly increasing"),
+    "too few": ({"contact_dofs": np.arange(3)}, "B touches 9 unknowns outside the declared contact_dofs"),
+    "integrals": ({"multiplier_integrals": lambda _: -np.ones(12)}, "`multiplier_integrals` is -1 at entry 0"),
+    "a pair": ({"contact": lambda s, mu: (s.mass, np.ones(12))}, "what `contact` returned has the type tuple"),
+    "a writer": ({"contact": lambda s, mu: mu.fill(0.0)}, "ValueError: "),
+    "one entry": ({"sampler": lambda s, w: lambda mu: {"f": np.ones(1)}}, "f of `sampler` has shape (1,), expected ("),
+    "no entry": ({"sampler": lambda s, w: lambda mu: {}}, "f of `sampler` has the type NoneType, expected an array ("),
+    "no sampler": ({"sampler": lambda s, w: None}, "TypeError: 'NoneType' object is not callable"),
+    "a tuple": ({"assemble": lambda s, mu: (mu, mu)}, "`assemble` returned a tuple, expected a VariationalInequality"),
+    "reasons": ({"refuse": lambda s, mu, u, lam: "a\nb"}, "at mu = [4.0]: a b"),
+    "a thief": ({"refuse": lambda s, mu, u, lam: u.fill(0.0)}, "ValueError: "),
+    "a start": ({"start": lambda s, mu, nearest: [True] * 12}, "start returns [True, True, True"),
+    "far away": ({"validation_set": lambda s, n, seed: np.full((n, 1), 9.0)}, "has 'force' outside [4, 8]"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", RETURNS)
+def test_what_a_problem_returns_is_taken_or_named_in_a_line(what: str) -> None:
+    members, words = RETURNS[what]
+    declared = {"constant": frozenset({"A", "B", "g"}), "contact": Declared.contact, "entrywise": frozenset({"f"})}
+    declared |= {"sampler": Declared.sampler, "contact_dofs": np.arange(12)}
+    # Without `contact` the contact unknowns alone are a declaration.
+    base = Wire if what == "too few" else type("Base", (Wire,), {"__module__": __name__, **declared})
+    problem = variant(base, **members)
+    with pytest.raises((NumericalError, RequestError), match=re.escape(words)) as caught:  # noqa: PT012
+        Reduction(problem, None, None, None, None, assembly="reduced").snapshots  # noqa: B018
+        validation_parameters(problem, 2, 0)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("given", [None, "x", np.zeros(2), np.zeros((1, 1)), np.array([np.nan]), [5.0]])
+def test_methods_of_a_plugin_refuse_wrong_arguments(given: Any) -> None:
+    for call in (WIRE.assemble, WIRE.constraint, lambda mu: Declared().picture(mu, np.ones(12), np.ones(12))):
+        with pytest.raises(RequestError, match="mu of "):
+            call(given)
 
 
 def test_what_is_true_is_confirmed_whatever_the_units_and_absent_rows() -> None:

@@ -94,7 +94,7 @@ def right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         "offline-pga.build.tolerance": 0.5, "check_cone.W": pack.W,
         "Run.report.path": Path("r.html"), "Offline.basis": reduction.pod.basis,
         "Offline.span": reduction.cone.generators, "Offline.training": mu[None], "pack_digest.path": str(folder),
-        "read_model_pack.path": str(folder),
+        "read_model_pack.path": str(folder), "foreign.kind": RequestError, "foreign.what": "a library",
     }  # fmt: skip
     return own | {
         "instances": {type(one): one for one in (run, model, reduction, space, size, solver, sums, pack.parameters)},

@@ -74,7 +74,7 @@ def test_conforms(check):
 def test_checks_are_tests_of_pytest(tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text(TESTS)
     (tmp_path / "pytest.ini").write_text("[pytest]\n")
-    cases = "Exits-one assembly", "Wire-assembly by entries", "Unannotated-options", "BadCone-cone", "BadCone-errors"
+    cases = "Exits-one assembly", "Wire-declarations", "Unannotated-options", "BadCone-cone", "BadCone-errors"
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", "-rA"]
     command += [f"test_mine.py::test_conforms[{name}]" for name in cases]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder)}
@@ -82,7 +82,7 @@ def test_checks_are_tests_of_pytest(tmp_path: Path) -> None:
     assert done.returncode == 1
     for words in (
         "FAILED test_mine.py::test_conforms[Exits-one assembly] - ", "the worker process died with exit code 3",
-        "PASSED test_mine.py::test_conforms[Wire-assembly by entries]",
+        "PASSED test_mine.py::test_conforms[Wire-declarations]",
         "PASSED test_mine.py::test_conforms[Unannotated-options]",
         "ConformanceWarning: Unannotated, options: the option 'depth' has no annotation",
         "FAILED test_mine.py::test_conforms[BadCone-cone] - ", "negative coefficient", "it needs 'cone'",

@@ -51,12 +51,6 @@ class OfHashes(Uniform):
         return box.sample(self.size, self.seed + int("".join(str("abcdefg".index(one)) for one in order)))
 
 
-class Reseeds(Uniform):
-    def parameters(self, box: ParameterBox) -> Array:
-        np.random.seed(self.seed)  # noqa: NPY002
-        return box.lower + np.random.rand(self.size, box.dim) * (box.upper - box.lower)  # noqa: NPY002
-
-
 class Raises(Uniform):
     def parameters(self, box: ParameterBox) -> Array:
         raise ArithmeticError("no points today")
@@ -98,7 +92,6 @@ WRONG: Mapping[type[Sampling], tuple[str, str]] = {
     PerAxis: ("size", "2 parameters: size = 5 was asked for; there are 25 points"),
     Unseeded: ("determinism", "3 parameters: a second call gives different values of the points: entry ("),
     OfHashes: ("another process", "3 parameters: another process gives different values of the points: entry ("),
-    Reseeds: ("no mutation", "1 parameter: parameters changes NumPy's global random numbers"),
     Raises: ("parameters", "ArithmeticError: no points today (test_samplings.py, line "),
     Picky: ("parameters", "(position, height, stiffness) is accepted: only on Sundays"),
     Unpicklable: ("pickling", "the Unpicklable cannot be pickled"),

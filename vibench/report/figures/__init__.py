@@ -12,7 +12,7 @@ from vibench.errors import RequestError, foreign, in_a_line, unknown_name
 from vibench.files import read_regular, write_atomically
 from vibench.text import json_object
 
-with foreign("matplotlib"):
+with foreign("matplotlib cannot be used"):
     from matplotlib.figure import Figure
 
     from vibench.report.figures.answer_sheet import answer
