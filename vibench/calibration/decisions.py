@@ -33,7 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import inf, sqrt
+from math import inf, nan, sqrt
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -81,7 +81,7 @@ Predict = Callable[[Array], Prediction]
 
 
 class Sensors:
-    """Outputs of a problem by their names; a `RequestError` if there is no such output.
+    """Linear outputs of a problem by their names; a `RequestError` if there is no such output.
 
     High-fidelity solutions are as accurate as bounds allow for: their natural residuals are at most `accuracy`.
     """
@@ -109,7 +109,7 @@ class Sensors:
 class BoundedSensors:
     """Outputs of a reduced model with proved or verified bounds.
 
-    Raises a `RequestError` if the model has no bounds, an output is not linear, or no inf-sup constant is proved.
+    Raises a `RequestError` if the model has no bounds, an output is unknown, or no inf-sup constant is proved.
     """
 
     def __init__(self, model: Model, names: tuple[str, ...]) -> None:
@@ -117,10 +117,6 @@ class BoundedSensors:
         if model.certificate is None:
             raise RequestError("the model has no error bounds: a calibration needs one with bounds = true")
         self.model, self.certificate, self.base = model, model.certificate, model.certificate.base
-        for output in outputs:
-            if not output.linear:
-                linear = ", ".join(one.name for one in problem.outputs if one.linear)
-                raise RequestError(f"'{output.name}' is no linear output, and has no bound; linear: {linear or 'none'}")
         share = share_of_diagonal(problem.W)
         if not (self.base.inf_sup.value > 0.0 and share.proved and share.value > 0.0):
             raise RequestError(f"λ has no bound, which the accuracy of solutions needs: {self.base.inf_sup.note}")
@@ -303,6 +299,15 @@ class Decisions:
     def seconds(self) -> float:
         """CPU seconds of all queries and questions."""
         return self.counts.model_seconds + sum(seconds for _, seconds in self.answers.values())
+
+    @property
+    def high_fidelity_seconds(self) -> float:
+        """CPU seconds of a chain that the high-fidelity model decides: its mean, as n solutions take n times the mean.
+
+        It solves at every proposal in the box, and at the start. NaN if nothing was asked.
+        """
+        spent = [seconds for _, seconds in self.answers.values()]
+        return sum(spent) / len(spent) * (self.counts.decisions + 1) if spent else nan
 
     @property
     def claim(self) -> str:

@@ -7,7 +7,6 @@ import json
 import signal
 import zipfile
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Exit, Option
@@ -176,7 +175,5 @@ def _conclude(chain: Metropolis, folder: Path, training: float) -> None:
     echo(f"{decisions.claim}: {proved if decisions.claim == 'exact' else 'bounds are verified, not proved'}")
     ours = f"seconds: {decisions.seconds:.3g} for the chain, {training:.3g} for training"
     if decisions.answers:
-        # Every proposal in the box takes one solution, and so does the start.
-        solution = median(seconds for _, seconds in decisions.answers.values())
-        ours += f"; the high-fidelity chain takes about {solution * (counts.decisions + 1):.3g}"
+        ours += f"; the high-fidelity chain takes about {decisions.high_fidelity_seconds:.3g}"
     echo(ours, f"{folder}: chain.npz, posterior.csv, posterior.nc for arviz.from_netcdf, posterior.png")

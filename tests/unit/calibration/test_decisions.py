@@ -97,6 +97,8 @@ def test_chains_by_bounds_are_those_of_the_high_fidelity_model(noise: float) -> 
     assert counts.undecided < 0.2 * counts.decisions
     assert len(found.decisions.answers) < 0.5 * len(exact.decisions.answers)
     assert 0.1 < found.accepted.mean() < 0.6
+    spent = [seconds for _, seconds in found.decisions.answers.values()]
+    assert found.decisions.high_fidelity_seconds == pytest.approx(np.mean(spent) * len(exact.decisions.answers))
 
 
 def test_without_bounds_some_decisions_are_wrong_and_are_counted() -> None:
