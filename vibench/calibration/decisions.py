@@ -129,6 +129,8 @@ class BoundedSensors:
         reduced, self._of_alpha = model.reduced, of_lam @ model.reduced.generators
         assert isinstance(reduced, HyperReducedModel)  # as certificates need it
         self._of_y = of_u @ reduced.basis
+        # Steps are small: most rows that the last solution presses are pressed again.
+        self._last: tuple[Array, Array] | None = None
 
     def __call__(self, mu: Array) -> Prediction:
         """The outputs at mu (d,), with bounds that allow for the accuracy of the high-fidelity solution."""
@@ -138,11 +140,12 @@ class BoundedSensors:
         if model.solver is None:
             answer = model.online.solve(mu, settings)
         else:
-            answer = solver(assembled.program, factor=assembled.factor)
+            answer = solver(assembled.program, factor=assembled.factor, start=self._last)
         # Bounds hold for any pair: how well it solves the program shows in their size alone.
         if answer.x is None or answer.alpha is None or not (is_sound(answer.x) and is_sound(answer.alpha)):
             return Prediction.without_bounds(np.zeros(len(self._weights)))
         x, alpha = answer.x, np.maximum(answer.alpha, 0.0)
+        self._last = x, alpha
         outputs = self._of_y @ assembled.evaluated.in_space(x) + self._of_alpha @ alpha
         if not self._is_scaled and assembled.evaluated.contact is None:
             # Evaluated once for the bounds and the accuracy.

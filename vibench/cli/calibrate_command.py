@@ -111,6 +111,7 @@ def _walk(chain: Metropolis, steps: int, file: Path, about: str, *, fresh: bool)
     """Walk to the last step with the answers that the file has; Ctrl-C ends it after a step, and keeps all answers."""
     import numpy as np
     from rich.progress import Progress
+    from threadpoolctl import threadpool_limits
 
     from vibench.files import write_atomically, writing
     from vibench.text import new_console
@@ -123,7 +124,11 @@ def _walk(chain: Metropolis, steps: int, file: Path, about: str, *, fresh: bool)
     # No step is left half-way.
     handlers = {number: signal.signal(number, lambda got, _: stopped.append(got)) for number in ends}
     try:
-        with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+        # Programs are small: more threads only wait for each other, and would count in the seconds.
+        with (
+            threadpool_limits(1),
+            Progress(console=console, disable=not console.is_terminal, transient=True) as progress,
+        ):
             bar = progress.add_task("steps", total=steps)
             while chain.steps < steps and not stopped:
                 chain.step()
