@@ -231,9 +231,8 @@ class Decisions:
         audit: Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)], seed: Seed,
     ) -> None:  # fmt: skip
         self.data, self.counts, self.guarantee = data, Counts(0, 0, 0, 0, 0.0), Guarantee.CERTIFIED
-        self._box, self._predict = problem.parameters, predict
-        self._ask = Sensors(problem, data.sensors).high_fidelity()
-        self._audit, self._random = audit, np.random.default_rng(seed)
+        self._box, self._predict, self._audit = problem.parameters, predict, audit
+        self._ask, self._random = Sensors(problem, data.sensors).high_fidelity(), np.random.default_rng(seed)
         # Misfit and CPU seconds of the high-fidelity model by the bytes of the parameter: all that were asked, and
         # those that an interrupted run has asked before.
         self.answers: dict[bytes, tuple[float, float]] = {}
@@ -243,22 +242,20 @@ class Decisions:
 
     def interval(self, mu: Array) -> Interval:
         """Bounds of the misfit at mu (d,), ½ (s − d)ᵀ C⁻¹ (s − d); minus that is the log-likelihood."""
-        key = mu.tobytes()
-        if (known := self._recent.get(key)) is None:
-            known = self._recent[key] = self._estimated(mu)
-            if key in self.answers:
-                known.lower = known.upper = self.answers[key][0]
-        return known
-
-    def _estimated(self, mu: Array) -> Interval:
+        key, predict, known = mu.tobytes(), self._predict, Interval(0.0, inf, 0.0)
+        if key in self._recent:
+            return self._recent[key]
         # Bounds are claimed in the box alone.
-        if (predict := self._predict) is None or outside(self._box, mu).any():
-            return Interval(0.0, inf, 0.0)
-        (outputs, bounds, guarantee), seconds = timed(lambda: predict(mu))
-        self.counts.model_seconds += seconds.cpu
-        if guarantee is not Guarantee.CERTIFIED:
-            self.guarantee = Guarantee.VERIFIED
-        return Interval(*self.data.interval(outputs, bounds), self.data.misfit(outputs))
+        if predict is not None and not outside(self._box, mu).any():
+            (outputs, bounds, guarantee), seconds = timed(lambda: predict(mu))
+            self.counts.model_seconds += seconds.cpu
+            if guarantee is not Guarantee.CERTIFIED:
+                self.guarantee = Guarantee.VERIFIED
+            known = Interval(*self.data.interval(outputs, bounds), self.data.misfit(outputs))
+        if key in self.answers:
+            known.lower = known.upper = self.answers[key][0]
+        self._recent[key] = known
+        return known
 
     def ask(self, mu: Array) -> float:
         """The misfit of the high-fidelity model at mu (d,), which is kept; a `RefutedError` if bounds exclude it."""
@@ -269,8 +266,8 @@ class Decisions:
                 found = f"the high-fidelity misfit {misfit:.6g} is not between {known.lower:.6g} and {known.upper:.6g}"
                 raise RefutedError(f"the bounds are refuted at mu = {mu.tolist()}: {found}")
             self.answers[key] = misfit, seconds
-        known.lower = known.upper = self.answers[key][0]
-        return known.lower
+            known.lower = known.upper = misfit
+        return self.answers[key][0]
 
     def _solved(self, mu: Array) -> tuple[float, float]:
         outputs, seconds = timed(lambda: self._ask(mu))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import signal
 import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -108,35 +107,28 @@ def _write_synthetic(problem: Problem, mu: str, noise: float, file: Path, seed: 
 
 
 def _walk(chain: Metropolis, steps: int, file: Path, about: str, *, fresh: bool) -> None:
-    """Walk to the last step with the answers that the file has; Ctrl-C ends it after a step, and keeps all answers."""
+    """Walk to the last step with the answers that the file has; Ctrl-C ends it, and keeps all answers."""
     import numpy as np
-    from rich.progress import Progress
+    from rich.progress import track
     from threadpoolctl import threadpool_limits
 
     from vibench.files import write_atomically, writing
     from vibench.text import new_console
 
-    decisions, stopped, content = chain.decisions, list[int](), io.BytesIO()
+    decisions, content, console, stopped = chain.decisions, io.BytesIO(), new_console(), False
     if file.exists() and not fresh:
         with placed(f"'{file}'"):
             decisions.earlier = _answers(file, about, chain.prior.box.dim)
-    console, ends = new_console(), (signal.SIGINT, signal.SIGTERM)
-    # No step is left half-way.
-    handlers = {number: signal.signal(number, lambda got, _: stopped.append(got)) for number in ends}
     try:
         # Programs are small: more threads only wait for each other, and would count in the seconds.
-        with (
-            threadpool_limits(1),
-            Progress(console=console, disable=not console.is_terminal, transient=True) as progress,
-        ):
-            bar = progress.add_task("steps", total=steps)
-            while chain.steps < steps and not stopped:
+        with threadpool_limits(1):
+            for _ in track(range(steps), "steps", console=console, disable=not console.is_terminal, transient=True):
                 chain.step()
-                progress.update(bar, completed=chain.steps)
+    # A step that is left half-way is walked again: a chain that continues starts anew, and knows the answers.
+    except KeyboardInterrupt:
+        stopped = True
     # What refutes bounds is raised again: the answers up to there are kept, too.
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
         known = decisions.earlier | decisions.answers
         asked = np.array([np.frombuffer(key) for key in known]).reshape(-1, chain.prior.box.dim)
         answers = np.array([*known.values()]).reshape(-1, 2)
