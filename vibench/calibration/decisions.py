@@ -130,7 +130,7 @@ class BoundedSensors:
         assert isinstance(reduced, HyperReducedModel)  # as certificates need it
         self._of_y = of_u @ reduced.basis
         # Steps are small: most rows that the last solution presses are pressed again.
-        self._last: tuple[Array, Array] | None = None
+        self._last = np.zeros(0), np.zeros(0)
 
     def __call__(self, mu: Array) -> Prediction:
         """The outputs at mu (d,), with bounds that allow for the accuracy of the high-fidelity solution."""
@@ -140,7 +140,9 @@ class BoundedSensors:
         if model.solver is None:
             answer = model.online.solve(mu, settings)
         else:
-            answer = solver(assembled.program, factor=assembled.factor, start=self._last)
+            # Enrichments at the parameter may have another number of vectors.
+            start = self._last if len(self._last[0]) == len(assembled.program.f) else None
+            answer = solver(assembled.program, factor=assembled.factor, start=start)
         # Bounds hold for any pair: how well it solves the program shows in their size alone.
         if answer.x is None or answer.alpha is None or not (is_sound(answer.x) and is_sound(answer.alpha)):
             return Prediction.without_bounds(np.zeros(len(self._weights)))

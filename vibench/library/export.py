@@ -106,7 +106,7 @@ def export_model(
         raise RequestError(f"'{script}' exists and is not the runtime of this version; choose another folder")
     found = exported(model, tolerance, evaluations, bases, c)
     given = found.arrays, found.about, file.stem
-    texts = c_source.source(found.members, *given, found.thetas, found.exact) if c else ()
+    texts = list(c_source.source(found.members, *given, found.thetas, found.exact) if c else ())
     # The modes stand in the order of the numbers that the certificate in C takes.
     contents[file] = fmu(texts[0], *given, [*CorrectionMode].index(model.correction)) if is_fmu else _npz(found)
     contents |= {path: text.encode() for path, text in zip(sources, texts, strict=False)}
