@@ -85,7 +85,7 @@ def compare(folder: Path) -> None:
             chain, _ = chain_of(decisions, problem)
             counts, solved = decisions.counts, [spent for _, spent in decisions.answers.values()]
             # Both at the pace of this run: the high-fidelity chain may have been walked in another hour.
-            own, seconds = decisions.seconds, float(np.mean(solved)) * solutions
+            own, seconds = decisions.seconds, decisions.high_fidelity_seconds
             share = own / seconds
             # Training and this share of the high-fidelity chain are a tenth of it from so many steps on.
             tenth = training / (0.1 - share) / seconds * STEPS if share < 0.1 else np.inf

@@ -117,11 +117,14 @@ class Prior:
 
 
 def outputs_of(problem: Problem, names: Sequence[str]) -> tuple[Output, ...]:
-    """The outputs of a problem by their names; a `RequestError` if there is no such output."""
+    """Linear outputs of a problem by their names; a `RequestError` if there is none, or no bound of its errors."""
     known = {output.name: output for output in problem.outputs}
     for name in names:
         if name not in known:
             raise unknown_name("output of the problem", name, known)
+        if not known[name].linear:
+            linear = ", ".join(each for each, one in known.items() if one.linear)
+            raise RequestError(f"'{name}' is no linear output, and has no bound; linear: {linear or 'none'}")
     return tuple(known[name] for name in names)
 
 

@@ -33,7 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import inf, sqrt
+from math import inf, nan, sqrt
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -81,7 +81,7 @@ Predict = Callable[[Array], Prediction]
 
 
 class Sensors:
-    """Outputs of a problem by their names; a `RequestError` if there is no such output.
+    """Linear outputs of a problem by their names; a `RequestError` if there is no such output.
 
     High-fidelity solutions are as accurate as bounds allow for: their natural residuals are at most `accuracy`.
     """
@@ -109,7 +109,7 @@ class Sensors:
 class BoundedSensors:
     """Outputs of a reduced model with proved or verified bounds.
 
-    Raises a `RequestError` if the model has no bounds, an output is not linear, or no inf-sup constant is proved.
+    Raises a `RequestError` if the model has no bounds, an output is unknown, or no inf-sup constant is proved.
     """
 
     def __init__(self, model: Model, names: tuple[str, ...]) -> None:
@@ -117,10 +117,6 @@ class BoundedSensors:
         if model.certificate is None:
             raise RequestError("the model has no error bounds: a calibration needs one with bounds = true")
         self.model, self.certificate, self.base = model, model.certificate, model.certificate.base
-        for output in outputs:
-            if not output.linear:
-                linear = ", ".join(one.name for one in problem.outputs if one.linear)
-                raise RequestError(f"'{output.name}' is no linear output, and has no bound; linear: {linear or 'none'}")
         share = share_of_diagonal(problem.W)
         if not (self.base.inf_sup.value > 0.0 and share.proved and share.value > 0.0):
             raise RequestError(f"λ has no bound, which the accuracy of solutions needs: {self.base.inf_sup.note}")
@@ -133,6 +129,8 @@ class BoundedSensors:
         reduced, self._of_alpha = model.reduced, of_lam @ model.reduced.generators
         assert isinstance(reduced, HyperReducedModel)  # as certificates need it
         self._of_y = of_u @ reduced.basis
+        # Steps are small: most rows that the last solution presses are pressed again.
+        self._last = np.zeros(0), np.zeros(0)
 
     def __call__(self, mu: Array) -> Prediction:
         """The outputs at mu (d,), with bounds that allow for the accuracy of the high-fidelity solution."""
@@ -142,11 +140,14 @@ class BoundedSensors:
         if model.solver is None:
             answer = model.online.solve(mu, settings)
         else:
-            answer = solver(assembled.program, factor=assembled.factor)
+            # Enrichments at the parameter may have another number of vectors.
+            start = self._last if len(self._last[0]) == len(assembled.program.f) else None
+            answer = solver(assembled.program, factor=assembled.factor, start=start)
         # Bounds hold for any pair: how well it solves the program shows in their size alone.
         if answer.x is None or answer.alpha is None or not (is_sound(answer.x) and is_sound(answer.alpha)):
             return Prediction.without_bounds(np.zeros(len(self._weights)))
         x, alpha = answer.x, np.maximum(answer.alpha, 0.0)
+        self._last = x, alpha
         outputs = self._of_y @ assembled.evaluated.in_space(x) + self._of_alpha @ alpha
         if not self._is_scaled and assembled.evaluated.contact is None:
             # Evaluated once for the bounds and the accuracy.
@@ -232,9 +233,8 @@ class Decisions:
         audit: Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)], seed: Seed,
     ) -> None:  # fmt: skip
         self.data, self.counts, self.guarantee = data, Counts(0, 0, 0, 0, 0.0), Guarantee.CERTIFIED
-        self._box, self._predict = problem.parameters, predict
-        self._ask = Sensors(problem, data.sensors).high_fidelity()
-        self._audit, self._random = audit, np.random.default_rng(seed)
+        self._box, self._predict, self._audit = problem.parameters, predict, audit
+        self._ask, self._random = Sensors(problem, data.sensors).high_fidelity(), np.random.default_rng(seed)
         # Misfit and CPU seconds of the high-fidelity model by the bytes of the parameter: all that were asked, and
         # those that an interrupted run has asked before.
         self.answers: dict[bytes, tuple[float, float]] = {}
@@ -244,22 +244,20 @@ class Decisions:
 
     def interval(self, mu: Array) -> Interval:
         """Bounds of the misfit at mu (d,), ½ (s − d)ᵀ C⁻¹ (s − d); minus that is the log-likelihood."""
-        key = mu.tobytes()
-        if (known := self._recent.get(key)) is None:
-            known = self._recent[key] = self._estimated(mu)
-            if key in self.answers:
-                known.lower = known.upper = self.answers[key][0]
-        return known
-
-    def _estimated(self, mu: Array) -> Interval:
+        key, predict, known = mu.tobytes(), self._predict, Interval(0.0, inf, 0.0)
+        if key in self._recent:
+            return self._recent[key]
         # Bounds are claimed in the box alone.
-        if (predict := self._predict) is None or outside(self._box, mu).any():
-            return Interval(0.0, inf, 0.0)
-        (outputs, bounds, guarantee), seconds = timed(lambda: predict(mu))
-        self.counts.model_seconds += seconds.cpu
-        if guarantee is not Guarantee.CERTIFIED:
-            self.guarantee = Guarantee.VERIFIED
-        return Interval(*self.data.interval(outputs, bounds), self.data.misfit(outputs))
+        if predict is not None and not outside(self._box, mu).any():
+            (outputs, bounds, guarantee), seconds = timed(lambda: predict(mu))
+            self.counts.model_seconds += seconds.cpu
+            if guarantee is not Guarantee.CERTIFIED:
+                self.guarantee = Guarantee.VERIFIED
+            known = Interval(*self.data.interval(outputs, bounds), self.data.misfit(outputs))
+        if key in self.answers:
+            known.lower = known.upper = self.answers[key][0]
+        self._recent[key] = known
+        return known
 
     def ask(self, mu: Array) -> float:
         """The misfit of the high-fidelity model at mu (d,), which is kept; a `RefutedError` if bounds exclude it."""
@@ -270,8 +268,8 @@ class Decisions:
                 found = f"the high-fidelity misfit {misfit:.6g} is not between {known.lower:.6g} and {known.upper:.6g}"
                 raise RefutedError(f"the bounds are refuted at mu = {mu.tolist()}: {found}")
             self.answers[key] = misfit, seconds
-        known.lower = known.upper = self.answers[key][0]
-        return known.lower
+            known.lower = known.upper = misfit
+        return self.answers[key][0]
 
     def _solved(self, mu: Array) -> tuple[float, float]:
         outputs, seconds = timed(lambda: self._ask(mu))
@@ -303,6 +301,15 @@ class Decisions:
     def seconds(self) -> float:
         """CPU seconds of all queries and questions."""
         return self.counts.model_seconds + sum(seconds for _, seconds in self.answers.values())
+
+    @property
+    def high_fidelity_seconds(self) -> float:
+        """CPU seconds of a chain that the high-fidelity model decides: its mean, as n solutions take n times the mean.
+
+        It solves at every proposal in the box, and at the start. NaN if nothing was asked.
+        """
+        spent = [seconds for _, seconds in self.answers.values()]
+        return sum(spent) / len(spent) * (self.counts.decisions + 1) if spent else nan
 
     @property
     def claim(self) -> str:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-import signal
 import zipfile
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Exit, Option
@@ -109,30 +107,28 @@ def _write_synthetic(problem: Problem, mu: str, noise: float, file: Path, seed: 
 
 
 def _walk(chain: Metropolis, steps: int, file: Path, about: str, *, fresh: bool) -> None:
-    """Walk to the last step with the answers that the file has; Ctrl-C ends it after a step, and keeps all answers."""
+    """Walk to the last step with the answers that the file has; Ctrl-C ends it, and keeps all answers."""
     import numpy as np
-    from rich.progress import Progress
+    from rich.progress import track
+    from threadpoolctl import threadpool_limits
 
     from vibench.files import write_atomically, writing
     from vibench.text import new_console
 
-    decisions, stopped, content = chain.decisions, list[int](), io.BytesIO()
+    decisions, content, console, stopped = chain.decisions, io.BytesIO(), new_console(), False
     if file.exists() and not fresh:
         with placed(f"'{file}'"):
             decisions.earlier = _answers(file, about, chain.prior.box.dim)
-    console, ends = new_console(), (signal.SIGINT, signal.SIGTERM)
-    # No step is left half-way.
-    handlers = {number: signal.signal(number, lambda got, _: stopped.append(got)) for number in ends}
     try:
-        with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
-            bar = progress.add_task("steps", total=steps)
-            while chain.steps < steps and not stopped:
+        # Programs are small: more threads only wait for each other, and would count in the seconds.
+        with threadpool_limits(1):
+            for _ in track(range(steps), "steps", console=console, disable=not console.is_terminal, transient=True):
                 chain.step()
-                progress.update(bar, completed=chain.steps)
+    # A step that is left half-way is walked again: a chain that continues starts anew, and knows the answers.
+    except KeyboardInterrupt:
+        stopped = True
     # What refutes bounds is raised again: the answers up to there are kept, too.
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
         known = decisions.earlier | decisions.answers
         asked = np.array([np.frombuffer(key) for key in known]).reshape(-1, chain.prior.box.dim)
         answers = np.array([*known.values()]).reshape(-1, 2)
@@ -176,7 +172,5 @@ def _conclude(chain: Metropolis, folder: Path, training: float) -> None:
     echo(f"{decisions.claim}: {proved if decisions.claim == 'exact' else 'bounds are verified, not proved'}")
     ours = f"seconds: {decisions.seconds:.3g} for the chain, {training:.3g} for training"
     if decisions.answers:
-        # Every proposal in the box takes one solution, and so does the start.
-        solution = median(seconds for _, seconds in decisions.answers.values())
-        ours += f"; the high-fidelity chain takes about {solution * (counts.decisions + 1):.3g}"
+        ours += f"; the high-fidelity chain takes about {decisions.high_fidelity_seconds:.3g}"
     echo(ours, f"{folder}: chain.npz, posterior.csv, posterior.nc for arviz.from_netcdf, posterior.png")

@@ -103,25 +103,24 @@ def export_model(
         raise RequestError(f"'{file}': the model is written as an npz file, whose name must end in .npz, or .fmu")
     if file.parent.exists() and not file.parent.is_dir():
         raise RequestError(f"'{file.parent}' is no folder")
-    is_fmu = file.suffix == ".fmu"
-    sources = [file.with_suffix(".c"), file.with_suffix(".h")] if c and not is_fmu else []
+    # The script that is written beside arrays evaluates them without vibench.
+    script, sources = file.with_name("reduced_model.py"), [file.with_suffix(end) for end in (".c", ".h") if c]
+    contents = {script: (files("vibench.library") / script.name).read_bytes()}
+    if is_fmu := file.suffix == ".fmu":
+        bases, c, sources, contents = False, True, [], {}
     for path in (file, *sources):
         if path.exists():
             raise RequestError(f"'{path}' exists; remove it, or choose another name")
-    # The script that is written beside exported files evaluates them without vibench.
-    script = file.with_name("reduced_model.py")
-    runtime = (files("vibench.library") / script.name).read_bytes()
-    if not is_fmu and script.exists() and (not script.is_file() or script.read_bytes() != runtime):
+    if contents and script.exists() and (not script.is_file() or script.read_bytes() != contents[script]):
         raise RequestError(f"'{script}' exists and is not the runtime of this version; choose another folder")
-    found = exported(model, tolerance, evaluations, bases and not is_fmu, c or is_fmu)
+    found = exported(model, tolerance, evaluations, bases, c)
     given = found.arrays, found.about, file.stem
-    texts = list(c_source.source(found.members, *given, found.thetas, found.exact, found.code) if c or is_fmu else ())
-    if is_fmu:
-        # The modes stand in the order of the numbers that the certificate in C takes.
-        contents = {file: fmu(texts[0], *given, [*CorrectionMode].index(model.correction))}
-    else:
-        contents = {file: _npz(found)} | ({script: runtime} if found.code is None else {})
-        contents |= {path: text.encode() for path, text in zip(sources, texts, strict=True)}
+    texts = list(c_source.source(found.members, *given, found.thetas, found.exact, found.code) if c else ())
+    if found.code is not None:  # the script does not evaluate it
+        contents.pop(script, None)
+    # The modes stand in the order of the numbers that the certificate in C takes.
+    contents[file] = fmu(texts[0], *given, [*CorrectionMode].index(model.correction)) if is_fmu else _npz(found)
+    contents |= {path: text.encode() for path, text in zip(sources, texts, strict=False)}
     # All contents are computed before the first is written: a failure leaves no file.
     with writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from vibench.calibration.ranked import minimise
 from vibench.errors import RequestError
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineBound
+from vibench.offline.models import CellSolver
 from vibench.qp.verification import QPSolution
 from vibench_problems.radial import Radial
 
@@ -97,6 +99,8 @@ def test_chains_by_bounds_are_those_of_the_high_fidelity_model(noise: float) -> 
     assert counts.undecided < 0.2 * counts.decisions
     assert len(found.decisions.answers) < 0.5 * len(exact.decisions.answers)
     assert 0.1 < found.accepted.mean() < 0.6
+    spent = [seconds for _, seconds in found.decisions.answers.values()]
+    assert found.decisions.high_fidelity_seconds == pytest.approx(np.mean(spent) * len(exact.decisions.answers))
 
 
 def test_without_bounds_some_decisions_are_wrong_and_are_counted() -> None:
@@ -158,6 +162,22 @@ def test_where_there_is_no_bound_the_high_fidelity_model_is_asked(monkeypatch: p
         assert other.decisions.counts.undecided == other.decisions.counts.decisions > 0
         assert other.decisions.claim == "exact"
         assert np.array_equal(other.states, found.states)
+
+
+def test_queries_begin_with_the_last_solution_of_the_same_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    predict, starts, solve = BoundedSensors(radial(), NAMES), [], CellSolver.__call__
+
+    def noted(solver: CellSolver, *program: object, **given: Any) -> QPSolution:
+        starts.append(given["start"])
+        return solve(solver, *program, **given)
+
+    monkeypatch.setattr(CellSolver, "__call__", noted)
+    one, other = predict(TRUTH), predict(TRUTH)
+    np.testing.assert_allclose(one.outputs, other.outputs, rtol=1e-9)
+    predict._last = np.zeros(1), starts[1][1]
+    predict(TRUTH)
+    assert starts[0] is starts[2] is None
+    assert (starts[1][1] >= 0.0).all()
 
 
 def test_what_has_no_bound_is_refused() -> None:

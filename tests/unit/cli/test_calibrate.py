@@ -125,6 +125,15 @@ def test_faults_of_a_data_file_are_named(sensors: dict[str, Any], rest: str, sai
     assert "\n" not in str(caught.value)
 
 
+def test_outputs_without_bounds_are_refused_before_a_model_is_trained(
+    main: Main, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vibench.execution.recorded_cell.cell_model", None)
+    Path("data.toml").write_text('[sensors."contact half-width"]\nvalue = 0.1\nnoise = 0.01\n')
+    said = "'contact half-width' is no linear output, and has no bound; linear: contact force, indentation"
+    refused(main("calibrate", "hertz", "data.toml", "--option", "resolution=coarse"), said)
+
+
 def _lines(values: dict[str, Any]) -> str:
     return "".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items())
 
