@@ -203,6 +203,11 @@ def test_an_edit_changes_the_keys_of_what_it_may_determine_and_no_other(edit: Ca
         assert (keys(), {cell.code for cell in expand(TRAINED)}) == (before, codes), module
     edit("stages.base")
     assert keys() == before
+    edit("stages.query")  # determines the queries, and nothing before them
+    after = keys()
+    assert {label for label in before if before[label].isdisjoint(after[label])} == {"queries", "timing"}
+    assert {label for label in before if before[label] == after[label]} == {*before} - {"queries", "timing"}
+    before = after
     edit("stages.enrichment")
     after = keys()
     assert {label for label in before if before[label].isdisjoint(after[label])} >= {"enrichment", "assembly"}
