@@ -92,7 +92,10 @@ def refusal(path: Path) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("damages", [flips(1, 210, 8192), truncations(2, 60)], ids=["flips", "truncations"])
+MANY = pytest.param(flips(3, 3000, 8192), marks=pytest.mark.long, id="many flips")
+
+
+@pytest.mark.parametrize("damages", [flips(1, 210, 8192), truncations(2, 60), MANY], ids=["flips", "truncations", None])
 def test_damage_of_a_results_file_is_found_or_harmless(damages: Iterator[Damage], made: Path, results: Path) -> None:
     """As the file itself says it is: its digests are those that were written with it."""
     content, original = results.read_bytes(), everything(results)

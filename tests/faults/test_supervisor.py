@@ -224,9 +224,10 @@ def test_a_keeper_that_is_closed_stops_at_once_and_leaves_nobody(watcher: Superv
             watcher.run(job)
         stopped.append(True)
 
-    thread = threading.Thread(target=work)
+    thread = threading.Thread(target=work, daemon=True)
     thread.start()
     while not (diary.exists() and diary.read_text().endswith("\n")):
+        assert thread.is_alive()
         time.sleep(0.05)
     worker = int(diary.read_text().split()[0])
     watcher.close()

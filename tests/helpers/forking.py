@@ -152,6 +152,14 @@ def run_script(script: Path, *arguments: str, timeout: float = 600.0) -> subproc
     return subprocess.CompletedProcess([str(script), *arguments], process.wait(), out, err)
 
 
+def run_pytest(folder: Path, site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run `pytest ARGUMENTS` in a folder, with what is installed in another one."""
+    script = folder / "run_tests.py"
+    found = f"sys.path.insert(0, {str(site)!r})"
+    script.write_text(f"import sys\n{found}\nimport pytest\nsys.exit(pytest.main({[*arguments]}))\n")
+    return run_script(script)
+
+
 @contextlib.contextmanager
 def fork_workers(address: Callable[[], str] = template) -> Iterator[None]:
     """Block in which the worker processes that this process starts are forked, by the template at an address."""

@@ -19,12 +19,12 @@ import as_published
 import published
 
 
-@pytest.mark.parametrize(("problem", "nodes"), [("obstacle", 100), pytest.param("hertz", 700, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("problem", "nodes"), [("obstacle", 60), pytest.param("hertz", 700, marks=pytest.mark.long)])
 def test_both_make_one_model(problem: str, nodes: int, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     # the seconds do not matter here
     monkeypatch.setattr(as_published, "median_seconds", lambda work, **_: timed(work))
     # published greedies take seconds for each generator
-    small = replace(as_published.CASES[problem], queries=8, cone=Stop(tolerance=5e-2))
+    small = replace(as_published.CASES[problem], queries=4, cone=Stop(tolerance=5e-2))
     monkeypatch.setitem(as_published.CASES, problem, small)
     arguments = [problem, "--resolution", str(nodes), "--repeats", "1", "--out", str(tmp_path)]
     assert as_published.main(arguments) == 0, capsys.readouterr().out

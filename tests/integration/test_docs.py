@@ -24,13 +24,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from running import Main, Register, Vibench, rows, succeeded
-from samples import ROUNDS, toml
+from samples import toml
 
 import vibench
 from vibench.cli.main import app
 from vibench.errors import RequestError
 from vibench.execution import run as execution
-from vibench.execution.timing_plan import TimingPlan
+from vibench.execution.timing_plan import OfflinePlan, TimingPlan
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
 from vibench.results import formats, schema
@@ -314,12 +314,13 @@ def test_strategies_have_formulas_and_whatever_is_cited_is_in_the_bibliography()
 
 @pytest.fixture
 def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs are timed in few rounds, whatever their study says: for tests that look at no seconds."""
+    """Runs are timed in one round, and nothing offline twice: for tests that look at no seconds."""
 
     def plan(goals: Any, rounds: int, writer: Any, fewest: int) -> TimingPlan:
-        return TimingPlan(goals, min(rounds, ROUNDS), writer, min(fewest, ROUNDS))
+        return TimingPlan(goals, min(rounds, 1), writer, min(fewest, 1))
 
     monkeypatch.setattr(execution, "TimingPlan", plan)
+    monkeypatch.setattr(OfflinePlan, "repeats", lambda self, cells: [])
 
 
 @pytest.mark.usefixtures("few_rounds")

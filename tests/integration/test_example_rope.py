@@ -1,6 +1,5 @@
 """The example package: installed as a third party's, found by its entry points, run beside the built-in ones."""
 
-import os
 import shutil
 import subprocess
 import sys
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from forking import run_pytest
 from running import Vibench
 from samples import ROUNDS, write_study
 from sources import SOURCES, mentions
@@ -100,8 +100,6 @@ def test_every_cell_has_row_and_line_is_stable(cells: tuple[pd.DataFrame, pd.Dat
 
 def test_checks_and_tests_of_the_package_pass_where_installed(vibench: Vibench, site: Path, example: Path) -> None:
     assert " passed, 0 failed, 0 skipped" in vibench(example.parent, "check", FORMULATION, plugins=site).stdout
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider"]
-    environment = os.environ | {"PYTHONPATH": str(site)}
-    done = subprocess.run(command, cwd=example, env=environment, capture_output=True, text=True, check=False)
+    done = run_pytest(example, site, "-p", "no:cacheprovider")
     assert done.returncode == 0, done.stdout + done.stderr
     assert " passed" in done.stdout

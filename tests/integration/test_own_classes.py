@@ -67,7 +67,7 @@ if __name__ == "__main__":
         dual=[{"name": MyCone, "options": {"share": 0.5}}], tolerances=[{"pod": [1e-2], "dual": [1e-2]}],
     )
     told = Told()
-    run = vibench.run(study, sys.argv[1], jobs=2, observer=told)
+    run = vibench.run(study, sys.argv[1], jobs=1, observer=told)
     cells = run.cells.set_index("problem", drop=False).loc[["Wire", "short", "Slack"]]
     model = run.model(cells["cell"].iloc[0])
     rows = cells[["cell", "problem", "dual", "dual_options", "status", "reason", "error_u_mean"]]

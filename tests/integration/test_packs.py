@@ -17,7 +17,7 @@ from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 
 PACKED = {
-    "name": "packed", "seed": 2022, "validation": 4, "accuracy": 1e-8, "solvers": ["piqp"], "dual": ["mcpg"],
+    "name": "packed", "seed": 2022, "validation": 2, "accuracy": 1e-8, "solvers": ["piqp"], "dual": ["mcpg"],
     "primal": ["offline-pga"], "assembly": ["full", "reduced"], "timing_rounds": 1,
     "tolerances": [{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
 }  # fmt: skip

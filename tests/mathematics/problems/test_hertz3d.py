@@ -178,7 +178,7 @@ def test_the_force_converges_from_above_with_second_order() -> None:
     assert np.all(rates > 1.6)
 
 
-@pytest.mark.parametrize("poisson", [0.2, 0.3, 0.4])
+@pytest.mark.parametrize("poisson", [0.2, 0.4])
 def test_the_slopes_of_the_paraboloid_act_as_a_first_variation_says(poisson: float) -> None:
     """With slopes s the constraint has −s·u besides: the energy grows by ∫ p s·u, the force by its derivative."""
     mu = np.array([4.0, 4.0, 0.00125 / 4.0, poisson])

@@ -1,6 +1,5 @@
 """`vibench new`: packages that install, pass their own tests and give rows as they are; bad names leave nothing."""
 
-import os
 import subprocess
 import sys
 import tomllib
@@ -9,6 +8,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from forking import run_pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from running import Main, Vibench, refused, rows, succeeded
@@ -45,10 +45,8 @@ def site(written: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def test_the_tests_of_new_packages_are_green(written: dict[str, Path], site: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error"]
-    command += [str(folder / "tests") for folder in written.values()]
-    environment = os.environ | {"PYTHONPATH": str(site)}
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    tests = [str(folder / "tests") for folder in written.values()]
+    done = run_pytest(tmp_path, site, "-q", "-p", "no:cacheprovider", "-W", "error", *tests)
     assert done.returncode == 0, done.stdout
     checks = sum(len(case_of(kind).checks) for kind in NAMES)
     assert f"{checks + len(NAMES)} passed" in done.stdout  # every package has one more test

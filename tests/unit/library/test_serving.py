@@ -16,6 +16,7 @@ from running import Main, read_until, refused, started
 from samples import with_ways
 
 import vibench
+from vibench import interrupts
 from vibench.library.serving import ModelServer
 from vibench_problems.obstacle import Obstacle
 
@@ -35,11 +36,14 @@ def server(small_run: vibench.Run, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     with monkeypatch.context() as patch:
         patch.setattr(os, "getppid", lambda: parents[-1])
         with ModelServer(model, "127.0.0.1", 0) as server:
-            thread = threading.Thread(target=server.serve)
+            # A daemon: whatever ends the tests early is not kept waiting by a server whose parent lives.
+            thread = threading.Thread(target=server.serve, daemon=True)
             thread.start()
-            yield server
-            parents.append(2)
-            thread.join(10.0)
+            try:
+                yield server
+            finally:
+                parents.append(2)
+                thread.join(10.0)
             assert not thread.is_alive()
 
 
@@ -110,13 +114,15 @@ def test_what_is_no_request_gets_an_error_and_leaves_the_server_running(server: 
 
 
 def test_ctrl_c_ends_the_command(small_run: vibench.Run, main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
-    def serve(server: ModelServer) -> None:
-        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
-        while True:
-            server.handle_request()
+    def press(server: ModelServer) -> None:
+        signal.raise_signal(signal.SIGINT)
+        raise AssertionError("Ctrl-C is ignored")
 
-    monkeypatch.setattr(ModelServer, "serve", serve)
-    code, out, err = main("serve", str(small_run.path.parent), cell_of(small_run, "reduced"), "--port", "0")
+    # The server itself presses the keys where it waits: a timer would press them in another test if this one failed.
+    monkeypatch.setattr(ModelServer, "handle_timeout", press)
+    with interrupts.restored():
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background inherit it ignored
+        code, out, err = main("serve", str(small_run.path.parent), cell_of(small_run, "reduced"), "--port", "0")
     assert (code, err) == (130, "vibench: interrupted\n")
     assert "lower deflection), no bounds: `umbridge.HTTPModel('http://127.0.0.1:" in out
 

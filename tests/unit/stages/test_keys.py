@@ -12,6 +12,7 @@ import pytest
 from samples import SampleStore, small_study
 
 from vibench import provenance
+from vibench.calibration.metropolis import Metropolis
 from vibench.offline.assemblies import assemblies
 from vibench.plugins import registry
 from vibench.stages import timing_rounds
@@ -92,15 +93,17 @@ def traced(stage: Stage, store: Store) -> tuple[Result, set[str]]:
     """The result of a stage whose inputs are stored, and the modules of vibench whose functions ran for it."""
     codes: set[CodeType] = set()
 
-    def note(frame: FrameType, event: str, _: object) -> None:
-        if event == "call" and frame.f_code not in codes and not is_for_a_key(frame):
+    def note(frame: FrameType, _: str, __: object) -> None:
+        # As it returns nothing it is told of calls alone, neither of lines nor of returns.
+        if frame.f_code not in codes and not is_for_a_key(frame):
             codes.add(frame.f_code)
 
-    sys.setprofile(note)
+    before = sys.gettrace()
+    sys.settrace(note)
     try:
         result = stage.run(store)
     finally:
-        sys.setprofile(None)
+        sys.settrace(before)
     return result, {module_of(code) for code in codes} - {""}
 
 
@@ -124,6 +127,8 @@ def counts_for(stage: Stage, module: str) -> bool:
 def test_what_a_stage_runs_is_in_its_code(study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every stage is run with a note of the functions that are called; little is taken from what others have cached."""
     monkeypatch.setattr(timing_rounds, "QUERY_SUBSETS", 1)
+    # A chain of twenty steps, at each level of noise, runs the code that one of 400 does.
+    monkeypatch.setattr(Metropolis, "steps", property(lambda chain: 20 * len(chain.accepted)))
     store, missing = SampleStore(tmp_path), dict[str, set[str]]()
     for stage in stages_of(study):
         for cache in (build_problem, fingerprint_here, assemblies):
@@ -203,6 +208,11 @@ def test_an_edit_changes_the_keys_of_what_it_may_determine_and_no_other(edit: Ca
         assert (keys(), {cell.code for cell in expand(TRAINED)}) == (before, codes), module
     edit("stages.base")
     assert keys() == before
+    edit("stages.query")  # determines the queries, and nothing before them
+    after = keys()
+    assert {label for label in before if before[label].isdisjoint(after[label])} == {"queries", "timing"}
+    assert {label for label in before if before[label] == after[label]} == {*before} - {"queries", "timing"}
+    before = after
     edit("stages.enrichment")
     after = keys()
     assert {label for label in before if before[label].isdisjoint(after[label])} >= {"enrichment", "assembly"}

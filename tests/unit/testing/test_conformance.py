@@ -24,8 +24,10 @@ from vibench.testing import solvers
 from vibench.testing.case import difference, find_jump
 from vibench.testing.checks import Check, Doubt, Note, Verdict
 
+SLOW = {"hertz3d": pytest.mark.long}
+
 BUILT_IN = [
-    (word, entry.name)
+    pytest.param(word, entry.name, marks=SLOW.get(entry.name, ()))
     for word, kind in CHECKED.items()
     for entry in importlib.metadata.distribution("vibench").entry_points.select(group=kind.entry_points)
 ]
