@@ -250,7 +250,7 @@ class HyperReducedModel:
         return {name: getattr(self._operators, name).terms for name in self._operators.affine}
 
     def contact_terms(self) -> ContactTerms | None:
-        """What B and g on Φ are made of where both are evaluated on the contact unknowns; `None` elsewhere."""
+        """Parts of B and g on Φ where both are evaluated on the contact unknowns; `None` elsewhere."""
         if self._operators.B is not None or self._operators.g is not None:
             return None
         (tested, combination), loads = self._tested, self._loads
