@@ -66,7 +66,7 @@ class DualProgramModel(PhasesModel):
         reduced, whitened, _ = self._dual(mu)
         Y = whitened[:, 1:]
         S = Y.T @ Y
-        if self._is_signed:
+        if self._is_signed and len(S):
             S.flat[:: len(S) + 1] += 1e-10 * np.trace(S) / len(S)
         # The accuracy of a solver means nothing in directions that are round-off.
         if np.linalg.matrix_rank(S, tol=1e-14 * np.trace(S), hermitian=True) < len(S):
