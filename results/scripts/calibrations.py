@@ -1,6 +1,7 @@
 """The page of the study `calibration`: what decisions of chains cost the models of its cells.
 
-vibench run calibration --no-figures && python results/scripts/calibrations.py runs/calibration results/calibrations
+vibench run calibration --problem obstacle --problem hertz --dual-tol 1e-3 --no-figures
+python results/scripts/calibrations.py runs/calibration results/calibrations
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import pandas as pd
 from page import SECONDS, Page, made_by, origin, read, start
 
 NOISES = (0.03, 0.01, 0.003)
+OPTIONS = " --problem obstacle --problem hertz --dual-tol 1e-3 --no-figures"
 ABOUT = """Metropolis chains of 400 steps by the model of each cell, at three levels of noise. *asked* is the share of
 the decisions that bounds leave open; a model without bounds asks always. *wrong* counts decisions that the reduced
 model alone takes otherwise than the high-fidelity model. *share* is the CPU time of queries and questions over that
@@ -19,7 +21,7 @@ def main(run: str, target: str) -> None:
     cells, chains = read(run, "cells"), read(run, "calibrations")
     page = Page(
         target, "Calibration: models compared by what they decide",
-        made_by("calibrations", "calibrations", "calibration", options=" --no-figures"), SECONDS, ABOUT,
+        made_by("calibrations", "calibrations", "calibration", options=OPTIONS), SECONDS, ABOUT,
         machine=origin(cells),
     )  # fmt: skip
     fine = int((cells["status"] == "ok").sum())
@@ -46,7 +48,7 @@ def compared(cells: pd.DataFrame, chains: pd.DataFrame) -> pd.DataFrame:
 
 
 def _numbers(values: pd.Series) -> str:
-    return ", ".join("–" if pd.isna(one) else f"{one:.2g}" for one in values)
+    return ", ".join("–" if pd.isna(one) else f"{one:.3g}" for one in values)
 
 
 if __name__ == "__main__":
