@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from vibench.arrays import Array, Indices
+from vibench.signatures import AtLeastOne, bordered
 
 
+@bordered
 @dataclass(frozen=True)
 class ContactSource:
     """`Problem.contact` as C99, which exported programs evaluate.
@@ -27,4 +29,4 @@ class ContactSource:
 
     text: str
     tables: Mapping[str, Array | Indices | float]
-    entries: int
+    entries: AtLeastOne

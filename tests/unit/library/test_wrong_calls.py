@@ -115,7 +115,8 @@ def right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         "seed": 0, "size": 2, "snapshots": np.eye(5, 4), "solver": "piqp", "span": np.eye(3, 2), "stop": size,
         "study": vibench.Study(**STUDY), "terms": (mu,), "theta": np.ones(3), "thetas": np.ones, "tolerance": 1e-8,
         "training": None, "u": np.ones(5), "unit": mu[None], "units": two, "upper": mu + 1.0, "vi": vi, "within": 0.1,
-        "x": np.zeros(2), "y": np.ones(5),
+        "x": np.zeros(2), "y": np.ones(5), "ContactSource.text": "", "ContactSource.tables": {"rows": 2},
+        "ContactSource.entries": 1,
     }  # fmt: skip
 
 
