@@ -19,7 +19,7 @@ class OddWire(Wire):
     parameters = ParameterBox((ODD,), np.array([4.0]), np.array([8.0]), (ODD,))
 
     def diagnostics(self, mu: Array) -> Mapping[str, float]:
-        return {ODD: 2**70, "-": float("nan")}
+        return {ODD: 2.0**70, "-": -0.0}
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
         x = np.linspace(0.0, 1.0, self.V.dim)[None]

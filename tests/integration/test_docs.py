@@ -251,7 +251,7 @@ def test_the_example_of_the_reference_is_a_study_and_its_rules_are_rules(tmp_pat
         ("measurement.md", 0, set()),
         ("tolerances.md", 2, {"runs"}),
         ("calibration.md", 3, set()),
-        ("methods.md", 34, {"points.npy"}),
+        ("methods.md", 36, {"points.npy"}),
     ],
 )
 def test_a_page_is_true(

@@ -35,7 +35,8 @@ ends = {
 running = [ends[name] for name in ("worker", "mesh", "benchmarks")]
 os.mkfifo(here / "pipe.msh")
 resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-signal.signal(signal.SIGINT, signal.SIG_DFL)
+for number in (signal.SIGINT, signal.SIGHUP):
+    signal.signal(number, signal.SIG_DFL)
 os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 parents = {}
 for name, end in ends.items():

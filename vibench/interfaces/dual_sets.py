@@ -24,7 +24,7 @@ import numpy as np
 from vibench.arrays import Array, Indices, Mask, read_only
 from vibench.errors import RequestError, UnsupportedError
 from vibench.linalg import EPS
-from vibench.signatures import bordered
+from vibench.signatures import bordered, constructed
 
 
 class BlockKind(StrEnum):
@@ -80,6 +80,7 @@ class Blocks:
         return np.column_stack([inside[:, :-1] * share[:, None], height])
 
 
+@constructed
 @dataclass(frozen=True, eq=False)
 class DualSet:
     """The set K of the multipliers of m rows: these blocks, and a ray for every other row."""

@@ -194,7 +194,8 @@ def _certified(thetas: Mapping[str, AffinePolynomial | ExactMember], arrays: Map
     norms = own["certificate_norms"].size
     # Doubles on the stack of the certificate, for its documentation in the header.
     numbers = loads * (loads + 1) // 2 + 8 * rows + 20 * loads + norms + kept
-    sizes = dict.fromkeys(("theta_B", "theta_g"), 1) | {name: polynomial.terms.shape[1] for name, polynomial in thetas.items()}
+    sizes = dict.fromkeys(("theta_B", "theta_g"), 1)
+    sizes |= {name: polynomial.terms.shape[1] for name, polynomial in thetas.items()}
     declared = len(arrays.get("certificate_term_errors", ()))
     return sizes | {
         "rows": rows, "loads": loads, "moved": moved, "directions": directions, "kept": kept, "residual_terms": norms,

@@ -59,8 +59,11 @@ def test_a_posterior_in_one_command_which_continues_what_was_stopped(
         if chain.steps == 25:
             os.kill(os.getpid(), signal.SIGINT)
 
+    # Where the tests run in the background, Ctrl-C is ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     monkeypatch.setattr(Metropolis, "step", stopped)
     code, out, err = main(*COMMAND, *SYNTHETIC, "--out", "again")
+    signal.signal(signal.SIGINT, before)
     assert (code, err) == (130, "")
     assert "interrupted after 25 of 60 steps; the same command continues" in out
     monkeypatch.setattr(Metropolis, "step", step)

@@ -219,7 +219,7 @@ def test_wrong_requests_for_dask_are_refused_in_a_line(
         assert [warning.startswith(unsafe) for warning in warnings] == [True] * ("answers" in expected)
         assert "answers" in expected or line == f"vibench: {expected}"
     monkeypatch.setitem(sys.modules, "distributed", None)
-    refused(main("run", path, "--executor", "dask"), "install vibench with its extra 'cluster'")
+    refused(main("run", path, "--executor", "dask"), "of vibench's extra 'cluster'")
 
 
 @pytest.mark.parametrize(

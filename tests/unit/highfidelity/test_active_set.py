@@ -272,6 +272,6 @@ def test_a_start_depends_on_the_parameter_alone_and_can_be_copied_after_use() ->
 def test_a_start_of_the_wrong_kind_is_named(start: Mask) -> None:
     problem = Obstacle(400)
     problem.start = lambda mu, nearest: start  # type: ignore[method-assign]
-    expected = rf"start returns .*; expected \({problem.W.dim},\) and bool, a NestedStart, or None"
+    expected = rf"start returns .*; expected truth values \({problem.W.dim},\), a NestedStart, or None"
     with pytest.raises(NumericalError, match=expected):
         HighFidelitySolver(problem).solve(MU)

@@ -116,7 +116,8 @@ def right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         "study": vibench.Study(**STUDY), "terms": (mu,), "theta": np.ones(3), "thetas": np.ones, "tolerance": 1e-8,
         "training": None, "u": np.ones(5), "unit": mu[None], "units": two, "upper": mu + 1.0, "vi": vi, "within": 0.1,
         "x": np.zeros(2), "y": np.ones(5), "ContactSource.text": "", "ContactSource.tables": {"rows": 2},
-        "ContactSource.entries": 1,
+        "ContactSource.entries": 1, "Blocks.kind": vibench.BlockKind.DISC, "Blocks.rows": np.array([[0, 1]]),
+        "Blocks.radii": np.ones(1), "DualSet.blocks": (),
     }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import exact, space, spd
 
-from vibench import create
+from vibench import RAYS, create
 from vibench.errors import UnsupportedError
 from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.affine_problem import AffineProblem
@@ -558,7 +558,7 @@ def test_problems_that_cannot_be_certified_say_why() -> None:
     members = affine_decomposition(problem, problem.training_set(), 1e-3)
     with pytest.raises(UnsupportedError, match="contact unknowns"):
         certificate_base(problem, members, problem.training_set())
-    wide = cast(Any, SimpleNamespace(has_contact=True, contact_dofs=np.arange(30_000)))
+    wide = cast(Any, SimpleNamespace(has_contact=True, contact_dofs=np.arange(30_000), K=RAYS))
     assert unsupported(wide, {}) == (
         "the constraint touches 30000 unknowns, and certificates need their compliance, a dense matrix of 7 GB; the "
         "limit is 4.3 GB, 23170 unknowns"
