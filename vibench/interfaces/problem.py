@@ -169,7 +169,7 @@ class Problem(ABC):
     def __init_subclass__(cls, **named: Any) -> None:
         super().__init_subclass__(**named)
         # Queries and high-fidelity solutions that are timed call these: a check would take longer.
-        overridden(cls, __name__, "assemble", "contact", "start", "refuse")
+        overridden(cls, __name__, "contact", "start", "refuse")
 
     @classmethod
     def data_digest(cls, **options: Any) -> str:  # noqa: ARG003
