@@ -123,10 +123,9 @@ class Tresca(Problem):
         self.W = InnerProduct(sp.diags_array(self._lengths * np.maximum(1.0 - self.x**2, 1e-2)))
         self.K = DualSet.intervals(np.arange(len(self.x)), 1.0)
         self._load = np.zeros(len(self.free))
-        # u(0) under Hertz's traction of resultant 1 in |x| ≤ 1 is k L(1), with ln(a) left of L at other half-widths.
+        # u(0) under Hertz's traction of resultant 1 in |x| ≤ 1 is k L(1); at half-width a, L(a) = L(1) − ln a.
         self._compliance = 2.0 * (1.0 - poisson**2) / (np.pi * young)
-        self._far = 0.5 + np.log(2.0)
-        self._far += self._unit_slip() / self._compliance - self._far
+        self._far = self._unit_slip() / self._compliance
 
     def _unit_slip(self) -> float:
         """The displacement of x = 0 under Hertz's traction of resultant 1 in |x| ≤ 1."""
