@@ -21,6 +21,7 @@ from vibench.report.figures.data import ProblemTables, label
 from vibench.report.figures.style import Look, Looks, Series, caption_of, first_sentence
 from vibench.results import ranking
 from vibench.results.break_even import HIGH_FIDELITY, TAIL
+from vibench.results.formats import cell_text
 from vibench.results.paired_timing import PairedTiming
 from vibench.text import printable
 
@@ -162,4 +163,7 @@ def short(value: Any, digits: int) -> float | int | str | None:
     if math.isinf(number):
         return str(number)
     rounded = float(f"{number:.{digits}g}")
+    # The page rounds once more: what some digits leave halfway, or whole, would end apart from what other tables print.
+    if cell_text(rounded) != cell_text(number):
+        return number
     return int(rounded) if rounded.is_integer() and abs(rounded) < 1e15 else rounded

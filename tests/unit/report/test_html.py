@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from markupsafe import escape
 from outputs import Links, clean, elements
 from running import Changed, Main
@@ -15,6 +17,8 @@ from running import Changed, Main
 from vibench.library.runs import Run
 from vibench.report import html
 from vibench.report.findings import findings
+from vibench.report.plots import short
+from vibench.results.formats import cell_text
 from vibench.results.read import in_order, read_table
 from vibench.results.schema import STORED, TABLES
 from vibench.results.sqlite import FILE
@@ -48,6 +52,16 @@ def test_it_needs_nothing_but_itself_and_says_what_headings_and_pictures_mean(ma
     assert len(alternative) > 40
     assert caption.startswith(alternative)
     assert caption != alternative
+
+
+@given(st.floats(1e-9, 1e9))
+@example(3.3049998)
+@example(123456.4)
+def test_numbers_of_the_page_are_those_of_other_tables_though_they_are_rounded_twice(value: float) -> None:
+    for digits in (4, 6):
+        shown = short(value, digits)
+        assert isinstance(shown, float | int)
+        assert cell_text(float(shown)) == cell_text(value)
 
 
 def data(page: str, name: str) -> Any:
