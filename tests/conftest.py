@@ -10,7 +10,7 @@ from hypothesis import settings
 from template import TEMPLATE, template
 
 # The examples of a test are the same ones every time and everywhere; `--hypothesis-profile=explore` draws new ones.
-settings.register_profile("same", deadline=None, derandomize=True, database=None, max_examples=50)
+settings.register_profile("same", deadline=None, derandomize=True, database=None, max_examples=20)
 settings.register_profile("explore", deadline=None, print_blob=True)
 settings.load_profile("same")
 

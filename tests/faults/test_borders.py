@@ -3,7 +3,9 @@
 import os
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import nullcontext
+from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -21,23 +23,30 @@ EXPECTED = {
     for kind, (_, phases) in KINDS.items()
 }
 
+# Some hundred acts of formulations take minutes.
+EVERY = pytest.mark.parametrize("kind", [pytest.param("formulation", marks=pytest.mark.long), *list(KINDS)[1:]])
+Beside = Callable[..., Run]
+
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
-    """The honest ones alone, and after hostile plugins of every kind."""
-    found, fair = dict[str, Run](), [Honest, HonestNearest]
+def beside(tmp_path_factory: pytest.TempPathFactory) -> Beside:
+    """Function that runs the honest ones after hostile plugins of a kind, all of them or some, or alone."""
+    fair = [Honest, HonestNearest]
     honest = {"problem": [Wire], "dual": [HonestCone], "primal": [HonestSpace], "formulation": fair}
-    for kind in ("", *KINDS):
+
+    @cache
+    def of(kind: str, *some: str) -> Run:
         axes = honest | {"formulation": fair if kind in ("", "formulation") else [Honest]}
         # Last those that would make the honest ones wrong in silence.
-        for how in sorted(EXPECTED.get(kind, ()), key=lambda how: EXPECTED[kind][how] == CHANGED, reverse=True):
+        for how in sorted(some or EXPECTED.get(kind, ()), key=lambda how: EXPECTED[kind][how] == CHANGED, reverse=True):
             axes[kind] = [{"name": KINDS[kind][0], "label": how, "options": {"how": how}}, *axes[kind]]
         study = Study(
             name="borders", seed=3, validation=2, solvers=["piqp"], timing_rounds=1, limits={"query_seconds": 1.0},
             tolerances=[{"pod": [1e-3], "dual": [1e-2]}], **axes,
         )  # fmt: skip
-        found[kind] = run(study, tmp_path_factory.mktemp("borders"), jobs=1, fresh=True, progress=False)
-    return found
+        return run(study, tmp_path_factory.mktemp("borders"), jobs=1, fresh=True, progress=False)
+
+    return of
 
 
 def honest(found: Run, table: str, formulations: list[str]) -> pd.DataFrame:
@@ -48,19 +57,19 @@ def honest(found: Run, table: str, formulations: list[str]) -> pd.DataFrame:
     return rows[[name for name in rows if not name.endswith((*MEASURED, "study_hash"))]].reset_index(drop=True)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_honest_rows_are_those_of_a_run_alone(runs: dict[str, Run], kind: str) -> None:
+@EVERY
+def test_honest_rows_are_those_of_a_run_alone(beside: Beside, kind: str) -> None:
     names = ["Honest", "HonestNearest"][: 2 if kind == "formulation" else 1]
     for table in ("cells", "queries"):
-        alone, beside = (honest(runs[one], table, names) for one in ("", kind))
+        alone, found = (honest(beside(one), table, names) for one in ("", kind))
         assert len(alone) >= len(names)
         assert set(alone["status"]) == {"ok"}
-        pd.testing.assert_frame_equal(beside, alone, check_exact=True, check_dtype=False)
+        pd.testing.assert_frame_equal(found, alone, check_exact=True, check_dtype=False)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_what_misbehaves_says_so_in_its_own_rows(runs: dict[str, Run], kind: str) -> None:
-    wrong, cells = {}, runs[kind].table("cells").set_index(kind)
+@EVERY
+def test_what_misbehaves_says_so_in_its_own_rows(beside: Beside, kind: str) -> None:
+    wrong, cells = {}, beside(kind).table("cells").set_index(kind)
     for how, said in EXPECTED[kind].items():
         (status, _, words), found = said.partition(": "), cells.loc[how]
         if found["status"] != status or words not in found["reason"] or "\n" in found["reason"]:
@@ -78,8 +87,10 @@ def test_what_a_sampling_does_to_the_process_of_the_command_is_undone() -> None:
             assert before == (sys.path, np.geterr(), signal.getsignal(signal.SIGTERM), os.environ), how
 
 
-def test_buffers_are_judged_by_what_they_held_and_work_in_reconstruct_is_of_the_query(runs: dict[str, Run]) -> None:
-    cells = runs["formulation"].table("cells").set_index("formulation")
+def test_buffers_are_judged_by_what_they_held_and_work_in_reconstruct_is_of_the_query(
+    beside: Beside,
+) -> None:
+    cells = beside("formulation", "pair-buffer", "reconstruct-solves").table("cells").set_index("formulation")
     for name in ("error_u_mean", "error_lambda_mean"):
         assert cells.loc["pair-buffer", name] == cells.loc["Honest", name]
     cheat, fair = cells.loc["reconstruct-solves"], cells.loc["Honest"]

@@ -116,6 +116,7 @@ def test_damage_of_a_results_file_is_found_or_harmless(damages: Iterator[Damage]
     assert [line for line in lines if not line.isprintable() or str(results.parent) not in line] == []
 
 
+@pytest.mark.long
 def test_every_number_of_a_results_file_is_watched(results: Path) -> None:
     """One value of every column that has one, changed in its last bit or letter."""
     with closing(sqlite3.connect(results)) as db:

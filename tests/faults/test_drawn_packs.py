@@ -186,6 +186,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_utime - spent, file=sys.stderr
 """Writes the packs first; the limit of memory and the hook are for reading."""
 
 
+@pytest.mark.long
 def test_drawn_packs_are_read_or_refused_in_a_line(tmp_path: Path) -> None:
     pytest.importorskip("h5py")
     pytest.importorskip("meshio")

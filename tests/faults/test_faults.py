@@ -92,6 +92,7 @@ def kill_at_random(arguments: list[str], place: Path, plugins: Path, rng: random
 LONGER = [pytest.param(50, executor, "long", marks=pytest.mark.long) for executor in ("local", "dask")]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kills", "executor", "length"), [(2, "local", "short"), *LONGER])
 def test_a_run_that_is_killed_again_and_again_loses_and_doubles_nothing(
     kills: int, executor: str, length: str, undisturbed: Callable[[str], Undisturbed], plugins_folder: Path,

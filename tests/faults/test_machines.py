@@ -36,6 +36,7 @@ def test_too_many_jobs_or_too_few_files_are_said(main: Main, tmp_path: Path, mon
     assert refused(main("run", study, "--executor", "dask", "--jobs", "2")) == f"vibench: {line}"
 
 
+@pytest.mark.long
 @pytest.mark.skipif(solver_version("ecos") != "", reason="ecos is installed")
 def test_a_run_does_not_depend_on_asserts_letters_of_an_encoding_nor_folders_called_like_a_library(
     command: str, plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -45,6 +45,7 @@ def test_a_package_that_meddles_with_its_process_costs_no_other(vibench: Vibench
     assert "does the solver remember answers?" in rough["timing_reason"]
 
 
+@pytest.mark.long
 def test_a_name_of_two_packages(vibench: Vibench, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     site = add(install(tmp_path / "site", fake_plugins, FAKES), tmp_path_factory, meddling.TAKEN)
     study = wire_study(dual=["cpg", "mcpg"], solvers=["piqp", "careful", "osqp", "counts"])

@@ -24,6 +24,7 @@ def run(tmp_path: Path) -> Path:
     return write_sample_run(tmp_path / "run").parent
 
 
+@pytest.mark.long
 def test_sites_on_full_disks_or_killed_are_whole_or_not_there(run: Path, vibench: Vibench, tmp_path: Path) -> None:
     for kib in (20, 600):
         done = vibench(tmp_path, "publish", str(run), str(tmp_path / "site"), "--no-figures", "--yes", file_kib=kib)
@@ -101,6 +102,7 @@ def of_another_user(path: Path) -> Iterator[None]:
         path.chmod(0o755)
 
 
+@pytest.mark.long
 def test_odd_folders_and_clocks(run: Path, main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for line in ("show theirs", "publish --yes theirs theirs/site --no-figures", "report theirs --no-figures"):

@@ -100,6 +100,7 @@ def test_the_run_ends_with_a_row_for_every_cell_and_printable_names(ended: tuple
     assert len(shown) == 3
 
 
+@pytest.mark.long
 def test_whatever_is_printed_and_written_is_printable_and_resumed(ended: tuple[Path, str], vibench: Vibench) -> None:
     folder, printed = ended
     run = folder / "run"

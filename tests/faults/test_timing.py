@@ -29,6 +29,7 @@ def test_a_solver_that_dies_in_a_round_costs_that_round(
     assert (timed.count("dies-once"), timed.count("piqp")) == (ROUNDS - lost, ROUNDS)
 
 
+@pytest.mark.long
 def test_what_was_never_answered_or_timed_leaves_the_others_or_is_timed_next(vibench: Vibench, tmp_path: Path) -> None:
     study = wire_study(solvers=["dies", "raises", "piqp"], dual=["cone-raises", "cpg"])
     (tmp_path / "other").mkdir()

@@ -19,7 +19,8 @@ import as_published
 import published
 
 
-@pytest.mark.parametrize(("problem", "nodes"), [("obstacle", 60), pytest.param("hertz", 700, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize(("problem", "nodes"), [("obstacle", 60), ("hertz", 700)])
 def test_both_make_one_model(problem: str, nodes: int, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     # the seconds do not matter here
     monkeypatch.setattr(as_published, "median_seconds", lambda work, **_: timed(work))

@@ -71,6 +71,7 @@ def third_party(tmp_path_factory: pytest.TempPathFactory) -> Timed:
 PRIMALS = ("decorrelated", "offline-pga", "enrichment-counts")
 
 
+@pytest.mark.long
 def test_what_is_only_registered_is_timed_in_every_stage_beside_what_was_reached(third_party: Timed) -> None:
     stages = ("high_fidelity_solution", "high_fidelity_sweep", "pod", "separation")
     expected = {f"{stage}[wire]" for stage in stages} | {"cone[wire-mcpg]"}

@@ -98,6 +98,7 @@ def test_every_cell_has_row_and_line_is_stable(cells: tuple[pd.DataFrame, pd.Dat
     assert (plain["beta_span"].to_numpy() < ours["beta_span"].to_numpy()).any()
 
 
+@pytest.mark.long
 def test_checks_and_tests_of_the_package_pass_where_installed(vibench: Vibench, site: Path, example: Path) -> None:
     assert " passed, 0 failed, 0 skipped" in vibench(example.parent, "check", FORMULATION, plugins=site).stdout
     done = run_pytest(example, site, "-p", "no:cacheprovider")

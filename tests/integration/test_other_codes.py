@@ -128,6 +128,7 @@ def test_a_block_in_space_of_freefem_has_the_pressure_of_uniform_compression(fre
         assert np.sqrt((exact.u - found.u) @ (A @ (exact.u - found.u))) <= found.bound.u_energy
 
 
+@pytest.mark.long
 def test_a_half_space_of_getfem_agrees_with_hertz(getfem: Path) -> None:
     """The force of an elliptic contact, up to what four cells along the zone and far faces that do not move cost."""
     subprocess.run([PYTHON, "paraboloid.py", "paraboloid", "4"], cwd=getfem, check=True, timeout=300)
@@ -138,6 +139,7 @@ def test_a_half_space_of_getfem_agrees_with_hertz(getfem: Path) -> None:
         assert force == pytest.approx(elliptic_contact(*mu[:3], 1.0 / (1.0 - mu[3] ** 2)).force, rel=0.07)
 
 
+@pytest.mark.long
 def test_the_model_of_getfem_agrees_with_hertz(getfem: Path) -> None:
     """Half-width a = √(4PR*/(πE*)) and peak 2P/(πa) of a line contact, by a fit of p² against x² in the contact."""
     pack = vibench.create("problem", "pack", {"path": str(getfem / "hertz")})

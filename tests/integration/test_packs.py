@@ -44,6 +44,7 @@ def numbers(folder: Path, table: str, problem: str) -> pd.DataFrame:
     return kept.sort_values([key for key in keys if key in kept]).reset_index(drop=True)
 
 
+@pytest.mark.long
 def test_a_study_on_packs_gives_the_numbers_of_their_problems(vibench: Vibench, tmp_path: Path) -> None:
     entries = []
     for problem, resolution in RESOLUTION.items():

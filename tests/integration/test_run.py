@@ -61,6 +61,7 @@ def test_retry_redoes_what_was_not_ok(vibench: Vibench, again: Path) -> None:
     assert len(rows(again / "runs" / "wire", "queries")) == 9
 
 
+@pytest.mark.long
 def test_fresh_starts_over_and_keeps_notes_and_damaged_results(vibench: Vibench, again: Path) -> None:
     execute(again / "runs" / "wire", "UPDATE cells SET reason = 'old'")
     notes = [again / "runs" / "wire" / name for name in ("notes.txt", "tables/notes.txt", "figures/my-own.svg")]

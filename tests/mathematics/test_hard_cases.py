@@ -25,7 +25,7 @@ from vibench_problems.bearing import Bearing
 Make = Callable[[int], AffineProblem]
 
 
-@pytest.mark.parametrize(("make", "size"), [*product([Beam, Truss], [40, 80]), (DoubleObstacle, 50)])
+@pytest.mark.parametrize(("make", "size"), [(Beam, 40), (Truss, 40), (DoubleObstacle, 50)])
 def test_solutions_are_those_of_a_hundred_digits(make: Make, size: int) -> None:
     problem = make(size)
     for mu in problem.parameters.sample(3, 1):
@@ -60,7 +60,7 @@ def test_what_condensation_loses_is_won_back() -> None:
             assert found.fallback == "solved without condensation"
 
 
-EVERYWHERE = [(Bearing, 80), (Put, 80), (partial(ThermalBlock, 3), 9), (Torsion, 10), (Covered, 8)]
+EVERYWHERE = [(Bearing, 40), (Put, 40), (partial(ThermalBlock, 3), 9), (Torsion, 10), (Covered, 8)]
 """Problems whose constraint touches most unknowns; the stiffness of the block has nine parameters."""
 
 

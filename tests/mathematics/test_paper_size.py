@@ -15,6 +15,8 @@ from vibench_strategies.cpg import CPG
 from vibench_strategies.mcpg import ModifiedCPG
 from vibench_strategies.offline_pga import OfflinePGA
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def training() -> tuple[Obstacle, np.ndarray, np.ndarray]:

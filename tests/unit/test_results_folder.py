@@ -158,6 +158,7 @@ def test_a_page_made_anew_is_as_light(changed: Changed, tmp_path: Path) -> None:
     assert "## Break-even of fixed enrichments" in text
 
 
+@pytest.mark.long
 def test_results_and_their_hashes_are_published_by_one_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All cells of a study have one hash of it, and pandas reads a column of such as numbers."""
     cells = pd.read_csv(RESULTS / "benefit" / "cells.csv").head(2).assign(study_hash="9369049480579e14")

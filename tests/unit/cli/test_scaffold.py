@@ -44,6 +44,7 @@ def site(written: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> 
     return folder
 
 
+@pytest.mark.long
 def test_the_tests_of_new_packages_are_green(written: dict[str, Path], site: Path, tmp_path: Path) -> None:
     tests = [str(folder / "tests") for folder in written.values()]
     done = run_pytest(tmp_path, site, "-q", "-p", "no:cacheprovider", "-W", "error", *tests)

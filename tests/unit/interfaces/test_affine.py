@@ -102,7 +102,7 @@ def test_constraints_may_touch_all_unknowns_or_none() -> None:
 
 
 @given(data=st.data())
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_a_sum_of_sparse_matrices_is_that_of_dense_ones(data: st.DataObject) -> None:
     shape, count = (data.draw(st.integers(1, 5)), data.draw(st.integers(1, 5))), data.draw(st.integers(1, 4))
     rng = np.random.default_rng(data.draw(st.integers(0, 99)))
@@ -200,7 +200,7 @@ def larger(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
     )
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(st.recursive(leaves, larger, max_leaves=8), st.floats(-10.0, 10.0), st.floats(-10.0, 10.0))
 def test_safe_expressions_have_the_values_of_python(text: str, a: float, b: float) -> None:
     expression = pickle.loads(pickle.dumps(Expression.parse(text, NAMES)))

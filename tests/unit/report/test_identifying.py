@@ -78,6 +78,7 @@ def test_a_site_names_neither_home_nor_user_nor_host(made: Path, main: Main, tmp
     assert succeeded(main(*again, *at)).split()[0] == row["cell"]
 
 
+@pytest.mark.long
 def test_damage_is_found_and_runs_of_one_name_do_not_tell_their_folders(made: Path, main: Main, tmp_path: Path) -> None:
     shutil.copytree(made, tmp_path / "run")
     with sqlite3.connect(tmp_path / "run" / FILE) as db:

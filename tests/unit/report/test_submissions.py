@@ -44,6 +44,7 @@ def again(script: ModuleType, site: Path, tmp_path_factory: pytest.TempPathFacto
     return script.published_again(site, tmp_path_factory.mktemp("again"))
 
 
+@pytest.mark.long
 def test_every_alteration_of_a_good_site_is_named(script: ModuleType, site: Path, again: Path, copied: Path) -> None:
     assert list(script.differences(site, again)) == []
     assert list(script.of_run(again / "runs" / "quick" / FILE)) == []

@@ -51,7 +51,7 @@ def rows(stage: CellQueries, store: SampleStore) -> list[Row]:
 
 @pytest.mark.parametrize("primal", ["decorrelated", "online-supremizers"])
 @pytest.mark.parametrize("interpolation", [None, 1e-6], ids=["full", "reduced"])
-@pytest.mark.parametrize("kind", ["wire", "string", "obstacle"])
+@pytest.mark.parametrize("kind", ["wire", "string", pytest.param("obstacle", marks=pytest.mark.long)])
 def test_reused_arrays_keep_numbers(kind: str, primal: str, interpolation: float | None, store: SampleStore) -> None:
     plain, other = (rows(cell(name, primal, interpolation), store) for name in (kind, f"{kind}, buffered"))
     assert plain[0]["status"] == "ok"

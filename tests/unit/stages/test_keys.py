@@ -123,6 +123,7 @@ def counts_for(stage: Stage, module: str) -> bool:
     return inside or any(counts_for(one, module) for one in stage.inputs())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("study", [TRAINED, ADAPTIVE], ids=lambda study: study.name)
 def test_what_a_stage_runs_is_in_its_code(study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every stage is run with a note of the functions that are called; little is taken from what others have cached."""

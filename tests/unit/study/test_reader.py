@@ -268,7 +268,7 @@ def places(value: Any, here: tuple[str | int, ...] = ()) -> list[tuple[str | int
     return [path for key, inner in steps for path in [(*here, key), *places(inner, (*here, key))]]
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_no_mutation_of_a_study_raises_anything_but_a_refusal(data: st.DataObject, tmp_path: Path) -> None:
     content: dict[str, Any] = changed(STUDY, "limits", to={"query_seconds": 5.0})
@@ -283,7 +283,7 @@ def test_no_mutation_of_a_study_raises_anything_but_a_refusal(data: st.DataObjec
         assert expand(study)
 
 
-@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(content=st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
 def test_no_file_raises_anything_but_a_refusal(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "study.toml"

@@ -71,6 +71,7 @@ def test_conforms(check):
 """
 
 
+@pytest.mark.long
 def test_checks_are_tests_of_pytest(tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text(TESTS)
     (tmp_path / "pytest.ini").write_text("[pytest]\n")

@@ -171,7 +171,7 @@ BETA = {"moving": BoundNote.NO_BODY, "scaled": BoundNote.SCALED, "half": BoundNo
 
 @pytest.mark.parametrize("kind", KINDS + TIED)
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-3, 1.0, 20.0]), st.floats(0.5, 2.0), st.floats(-1.0, 1.0))
-@settings(max_examples=16)
+@settings(max_examples=6)
 def test_no_error_is_above_its_bound(kind: tuple[str, bool, str], seed: int, size: float, a: float, b: float) -> None:
     """At any parameter of the box, for any x and any α ≥ 0, of both errors in all norms, and of the corrected pair.
 

@@ -73,7 +73,7 @@ SIZES = st.sampled_from([0.0, 1e-3, 1.0])
 
 @pytest.mark.parametrize("soft", [False, True])
 @given(st.integers(0, 10_000), SIZES, SIZES, st.sampled_from([1.0, 1.5, 20.0]), st.sampled_from([N, 5, 0]))
-@settings(max_examples=40)
+@settings(max_examples=15)
 def test_no_error_is_above_its_bound(
     soft: bool, seed: int, size: float, pressure: float, spread: float, kept: int
 ) -> None:
@@ -84,7 +84,7 @@ def test_no_error_is_above_its_bound(
 
 
 @given(st.integers(0, 10_000), SIZES, SIZES)
-@settings(max_examples=40)
+@settings(max_examples=15)
 def test_bounds_are_the_errors_where_the_stiffness_is_the_inner_product(
     seed: int, size: float, pressure: float
 ) -> None:

@@ -111,7 +111,7 @@ def test_a_straight_path_has_four_anchors_and_a_curve_the_others() -> None:
 
 
 @given(st.integers(0, 10_000), st.integers(1, 4), st.integers(0, 3))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_ranges_of_terms_bound_any_sum(seed: int, definite: int, others: int) -> None:
     """Semidefinite terms of low rank, and indefinite ones, with coefficients of any sign."""
     rng = np.random.default_rng(seed)
