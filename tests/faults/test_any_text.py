@@ -107,7 +107,8 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
 
 
 # The first example is the simplest one, without a text.
-@settings(max_examples=1)
+@pytest.mark.long
+@settings(max_examples=2)
 @given(text=ANYTHING, count=COUNTS)
 @example(text=ODD, count=2**80)
 @example(text=LABEL, count=float("nan"))

@@ -89,11 +89,10 @@ def kill_at_random(arguments: list[str], place: Path, plugins: Path, rng: random
     return True
 
 
-LONGER = [pytest.param(50, executor, "long", marks=pytest.mark.long) for executor in ("local", "dask")]
-
-
 @pytest.mark.long
-@pytest.mark.parametrize(("kills", "executor", "length"), [(2, "local", "short"), *LONGER])
+@pytest.mark.parametrize(
+    ("kills", "executor", "length"), [(2, "local", "short"), (50, "local", "long"), (50, "dask", "long")]
+)
 def test_a_run_that_is_killed_again_and_again_loses_and_doubles_nothing(
     kills: int, executor: str, length: str, undisturbed: Callable[[str], Undisturbed], plugins_folder: Path,
     vibench: Vibench, place: Path,
@@ -118,9 +117,10 @@ def test_a_run_that_is_killed_again_and_again_loses_and_doubles_nothing(
     assert at_work > 0 or kills < 10
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kib", "length"),
-    [*(pytest.param(kib, "long", marks=pytest.mark.long) for kib in (1, 12, 40, 100, 300)), (100, "short")],
+    [*((kib, "long") for kib in (1, 12, 40, 100, 300)), (100, "short")],
 )
 def test_a_full_disk_stops_a_run_with_one_line_and_a_later_one_completes_it(
     kib: int, length: str, undisturbed: Callable[[str], Undisturbed], vibench: Vibench, place: Path

@@ -74,6 +74,7 @@ def cells(run: Run) -> pd.DataFrame:
     return found[~found.index.duplicated()].sort_index()
 
 
+@pytest.mark.long
 def test_every_cell_has_a_row_with_a_reason_of_one_line_and_its_origin(cells: pd.DataFrame, run: Run) -> None:
     problems = ([*FINE["problem"], *BAD_PROBLEMS], FINE["dual"], FINE["primal"], FINE["solver"])
     solvers = (["wire"], FINE["dual"], ["decorrelated"], [*FINE["solver"], *BAD_SOLVERS])
@@ -88,6 +89,7 @@ def test_every_cell_has_a_row_with_a_reason_of_one_line_and_its_origin(cells: pd
         assert (cells[name] != "").all(), name
 
 
+@pytest.mark.long
 def test_tables_progress_and_logs_have_what_happened(run: Run) -> None:
     outputs = [one.stdout for one in run.done]
     for folder, printed in zip(run.folders, outputs, strict=True):
@@ -123,6 +125,7 @@ def test_tables_progress_and_logs_have_what_happened(run: Run) -> None:
     assert all("the last words" in log for log in logs)  # printed by what crashed right after
 
 
+@pytest.mark.long
 def test_a_plugin_that_misbehaves_costs_its_cells_alone_and_is_named(cells: pd.DataFrame) -> None:
     fine = cells.loc[list(pd.MultiIndex.from_product(FINE.values()))]
     assert set(fine["status"]) == {"ok"}

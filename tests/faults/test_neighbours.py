@@ -21,6 +21,7 @@ def add(folder: Path, temporary: pytest.TempPathFactory, members: dict[str, dict
     return folder
 
 
+@pytest.mark.long
 def test_a_package_that_meddles_with_its_process_costs_no_other(vibench: Vibench, both: Path, tmp_path: Path) -> None:
     """One worker process would serve them all; the rounds of the solvers are interleaved."""
     write_study(tmp_path, wire_study(problem=["wire-meddles", "wire"], solvers=["meddling", "roughly", "piqp"]))

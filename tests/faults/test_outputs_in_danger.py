@@ -53,6 +53,7 @@ def test_sites_on_full_disks_or_killed_are_whole_or_not_there(run: Path, vibench
     assert sorted(path.name for path in site.rglob("*")) == whole
 
 
+@pytest.mark.long
 def test_an_export_that_is_killed_is_whole_or_not_there(small_run: Run, vibench: Vibench, tmp_path: Path) -> None:
     rng, run = random.Random(9), str(small_run.path.parent)
     key = small_run.cells.set_index(["problem", "assembly"]).loc[("radial-obstacle", "reduced"), "cell"].iloc[0]

@@ -182,6 +182,7 @@ said("study.toml", lambda: read_study(str(folder / "study.toml")))
 """A process of its own, since opening a pipe would wait for ever."""
 
 
+@pytest.mark.long
 def test_pipes_of_others_are_refused_wherever_a_file_is_opened(run: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", PIPES, str(run)], capture_output=True, text=True, check=False, timeout=PATIENCE

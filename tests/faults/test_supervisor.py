@@ -109,6 +109,7 @@ def test_what_items_start_or_kill_ends_and_costs_themselves(watcher: Supervisor,
     assert found[1][1] != found[3][1]  # each death takes another process
 
 
+@pytest.mark.long
 def test_items_beyond_the_limit_of_the_cell_cost_themselves(run: Run) -> None:
     found = values(run(InItems(("interrupt", "fine", "fine"), unlimited=("", "exit", ""))))
     assert [isinstance(value, Failed) for _, value in found] == [True, True, False]
@@ -125,6 +126,7 @@ def test_items_beyond_the_limit_of_the_cell_cost_themselves(run: Run) -> None:
     assert {value.status for _, value in found[1:]} == {Status.TIMEOUT}
 
 
+@pytest.mark.long
 def test_memory_or_steps_that_are_not_of_an_item_cost_the_stage(run: Run) -> None:
     found = values(run(InItems(("fine", "hunger", "fine"))))
     assert found[1][1] == Failed(Status.ERROR, "out of memory: the limit is memory_gib = 8")

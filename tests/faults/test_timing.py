@@ -10,6 +10,7 @@ ANSWERS = 6
 """Calls of the solver before the timing begins: two for each of three queries."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("last_call", "lost"), [(ANSWERS + 1, 1), (ANSWERS + 1 + ROUNDS, 1), (ANSWERS, 0)])
 def test_a_solver_that_dies_in_a_round_costs_that_round(
     last_call: int, lost: int, vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -101,6 +101,7 @@ def test_what_is_only_registered_is_timed_in_every_stage_beside_what_was_reached
     assert "benchmarks left out: the snapshots of wire give N = " in third_party.err
 
 
+@pytest.mark.long
 def test_failures_have_reasons_passes_are_put_together_and_tables_fit(third_party: Timed) -> None:
     assert third_party.code == 1
     for name, reason in (

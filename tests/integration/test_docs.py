@@ -126,6 +126,7 @@ def test_kratos_gives_its_matrices() -> None:
     assert np.allclose(f, [2.0, 1.0, 2.0, 1.0])
 
 
+@pytest.mark.long
 def test_the_plugins_of_the_pages_run_through_a_benchmark(package: Path, vibench: Vibench, tmp_path: Path) -> None:
     study = tomllib.loads((package / "mine.toml").read_text())
     registered = tomllib.loads((package / "pyproject.toml").read_text())["project"]["entry-points"]

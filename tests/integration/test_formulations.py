@@ -54,6 +54,7 @@ def test_axes_that_a_formulation_does_not_have_are_neither_repeated_nor_needed()
         Study(formulation=["mixed", Nearest], **content)
 
 
+@pytest.mark.long
 def test_all_are_judged_by_the_same_bounds_and_misbehaviour_costs_its_rows(found: Run) -> None:
     queries = found.table("queries")
     ok = queries[queries["status"] == "ok"]

@@ -92,6 +92,7 @@ def test_the_model_of_freefem_runs_through_the_matrix(freefem: Path, monkeypatch
     assert constants["FreeFEM"] == pytest.approx(constants["vibench"], rel=0.1)
 
 
+@pytest.mark.long
 def test_the_signorini_problem_of_freefem_has_a_certified_model(freefem: Path) -> None:
     """All of its members are declared: bounds rest on nothing else, of the solution and of the corrected pair."""
     export_from_freefem(freefem, "signorini", "8")  # fmt: skip
@@ -109,6 +110,7 @@ def test_the_signorini_problem_of_freefem_has_a_certified_model(freefem: Path) -
     assert in_contact >= 6
 
 
+@pytest.mark.long
 def test_a_block_in_space_of_freefem_has_the_pressure_of_uniform_compression(freefem: Path) -> None:
     """On a flat foundation that is E times depth over height, whatever Poisson's ratio; a curved one leaves the block.
 

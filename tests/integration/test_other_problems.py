@@ -52,6 +52,7 @@ def run(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "runs" / STUDY["name"]
 
 
+@pytest.mark.long
 def test_every_query_is_ok_and_means_are_sensible_without_contact_too(run: Path) -> None:
     """But a put with generators of any sign and no supremizer, for which no point is feasible.
 

@@ -104,6 +104,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_the_same_classes_are_not_run_again_and_edited_ones_are(folder: Path) -> None:
     before = vibench.open_run(folder / "out").cells
     assert run_source(folder, f"# a remark\n{SCRIPT}")[0] == 0

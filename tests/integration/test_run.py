@@ -219,6 +219,7 @@ def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) 
     assert_same_numbers(tmp_path / "1", tmp_path / "2")
 
 
+@pytest.mark.long
 def test_artefacts_are_shared_on_one_machine(vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
     # high-fidelity solutions of both sets, and their constants at one; pictures; POD, cone, enrichment; assembly, exact

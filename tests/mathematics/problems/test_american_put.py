@@ -100,6 +100,7 @@ def test_the_expansion_of_the_load_is_exact_to_round_off(mu: list[float]) -> Non
     assert len(load_coefficients(np.array(mu))) == DEGREE + 2
 
 
+@pytest.mark.long
 def test_iterations_do_not_grow_with_the_mesh_and_a_cold_start_ends_without_a_fallback() -> None:
     counts = [HighFidelitySolver(Put(n, perpetual=True)).solve(PERPETUAL).iterations for n in (400, 1600, 6400)]
     assert max(counts) <= 8
@@ -113,6 +114,7 @@ def test_iterations_do_not_grow_with_the_mesh_and_a_cold_start_ends_without_a_fa
     pickle.loads(pickle.dumps(problem))  # with the solvers of coarser meshes, which are not copied
 
 
+@pytest.mark.long
 def test_the_dual_is_hard() -> None:
     """Multipliers jump at the exercise boundary, which moves: no space of 60 dimensions has them to 1 %.
 

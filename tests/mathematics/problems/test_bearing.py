@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numerics import fitted_rate
@@ -88,6 +89,7 @@ def test_the_film_pushes_the_shaft_back_and_aside_and_cavitates_where_it_widens(
     assert np.allclose(found.lam[inside], -mu[0] * np.sin(theta[inside]), rtol=0.01)
 
 
+@pytest.mark.long
 def test_few_modes_and_generators_suffice_and_reduced_assembly_is_exact() -> None:
     stops = Stop(tolerance=1e-3), Stop(tolerance=5e-2)
     reduction = Reduction(Bearing("paper"), ModifiedCPG(), OfflinePGA(), *stops, tolerance=0.1, assembly="reduced")

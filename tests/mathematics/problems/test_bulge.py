@@ -122,6 +122,7 @@ def test_online_and_offline_enrichment_differ() -> None:
     assert added[EGG()].shape[1] > 8 >= added[ROUND()].shape[1]  # online supremizers are 8 at every parameter
 
 
+@pytest.mark.long
 def test_members_are_sums_of_few_terms() -> None:
     """B and g exactly, f as a polynomial, A to what interpolation leaves between the training parameters."""
     members = affine_decomposition(EGG(), EGG().training_set(), 1e-6)

@@ -44,6 +44,7 @@ def test_sizes_and_resolutions() -> None:
     assert problem.training_set().ravel() == pytest.approx(0.7 + 0.0075 * np.arange(81))
 
 
+@pytest.mark.long
 def test_small_loads_agree_with_the_theory_and_larger_ones_less() -> None:
     problem = Hertz(3065, growth=1.05, approach=0.01)
     assert problem.W.dim == 140

@@ -169,6 +169,7 @@ def test_force_axes_peak_and_far_field_agree_with_the_closed_form(mu: np.ndarray
     assert m / k == pytest.approx(1.0 - 2.0 * mu[3], abs=0.05)
 
 
+@pytest.mark.long
 def test_the_force_converges_from_above_with_second_order() -> None:
     """Errors of odd and of even numbers of cells lie on two curves: these are even."""
     cells = np.array([2, 4, 6])
@@ -188,6 +189,7 @@ def test_the_slopes_of_the_paraboloid_act_as_a_first_variation_says(poisson: flo
     assert found == pytest.approx((1.0 - 2.0 * poisson) / (np.pi * (1.0 - poisson)), abs=0.04)
 
 
+@pytest.mark.long
 def test_a_clamped_far_face_adds_its_share_to_the_force_and_boussinesqs_field_does_not() -> None:
     mu = flattened(MUS[0])
     a, length = problem(6).theory(mu).a, problem(6).block.length

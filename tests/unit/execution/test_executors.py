@@ -124,6 +124,7 @@ def test_a_dask_worker_that_dies_is_survived(cluster: LocalCluster, tmp_path: Pa
         workers.close()
 
 
+@pytest.mark.long
 def test_dask_workers_get_the_classes_of_a_notebook(cluster: LocalCluster, tmp_path: Path) -> None:
     names: dict[str, Any] = {"__name__": "__main__"}
     exec("import fake_plugins\nclass Mine(fake_plugins.Wire):\n    pass\n", names)
@@ -178,6 +179,7 @@ def test_other_code_and_workers_without_artefacts_are_refused(
         Dask(cluster.scheduler_address, 1, tmp_path)
 
 
+@pytest.mark.long
 def test_a_cluster_that_is_shut_down_stops_the_run_with_a_line_and_it_goes_on_without(
     plugins_folder: Path, vibench: Vibench, tmp_path: Path
 ) -> None:
@@ -287,6 +289,7 @@ def refusal(context: ssl.SSLContext, plain: socket.socket) -> bool:
         return True
 
 
+@pytest.mark.long
 def test_dask_changes_no_number(vibench: Vibench, tmp_path: Path) -> None:
     study = wire_study(
         problem=[{"name": "wire", "options": {"nodes": 40}}], solvers=["piqp", "osqp", "gives-up"],

@@ -135,6 +135,7 @@ def is_running(process: Path) -> bool:
         return False
 
 
+@pytest.mark.long
 def test_a_server_ends_with_its_parent(command: str, small_run: vibench.Run, tmp_path: Path) -> None:
     serve = f"{command} serve {small_run.path.parent} {cell_of(small_run, 'certified')} --port 0 & echo $!; wait"
     with started(["sh", "-c", serve], tmp_path, tmp_path) as shell:

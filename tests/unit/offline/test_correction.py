@@ -40,6 +40,7 @@ def by(run: vibench.Run, correction: str) -> pd.DataFrame:
     return rows.set_index([*MODEL, "query"]).sort_index()
 
 
+@pytest.mark.long
 def test_corrected_rows_are_feasible_within_bounds_and_say_what_they_cost(corrected: vibench.Run) -> None:
     assert (corrected.cells["status"] == "ok").all()
     rows, plain = by(corrected, "feasible"), by(corrected, "none")

@@ -30,7 +30,11 @@ def with_mesh(folder: Path, name: str, secret: str = "") -> Path:
     return folder
 
 
-@pytest.mark.parametrize("ending", [".msh", ".vtu", ".vtk", ".mesh", ".ply", ".stl", ".off", ".obj"])
+# A process reads each of them.
+MORE = (pytest.param(ending, marks=pytest.mark.long) for ending in (".vtk", ".mesh", ".ply", ".off", ".obj"))
+
+
+@pytest.mark.parametrize("ending", [".msh", ".vtu", ".stl", *MORE])
 def test_formats_of_one_file_are_read(ending: str, tmp_path: Path) -> None:
     mesh = read_model_pack(with_mesh(tmp_path / "pack", f"mesh{ending}")).mesh
     assert mesh is not None
@@ -69,6 +73,7 @@ def test_what_is_no_regular_file_is_no_mesh(kind: str, tmp_path: Path) -> None:
             read(folder)
 
 
+@pytest.mark.long
 def test_a_mesh_takes_no_more_memory_than_it_may(tmp_path: Path) -> None:
     count = 2**25
     block = zlib.compress(bytes(count), 9)

@@ -397,6 +397,7 @@ def test_a_profile_ends_at_the_share_that_was_solved(change: Change, draw: Draw)
     assert "The run has one solver, piqp: there is no performance profile to draw." in figure.caption
 
 
+@pytest.mark.long
 def test_a_figure_drawn_twice_is_the_same_file(tables: Tables, tmp_path: Path) -> None:
     assert tables["hertz"].parameter == "radius µ [m]"
     assert tables["obstacle"].parameter == ""

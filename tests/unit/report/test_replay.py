@@ -133,6 +133,7 @@ def test_the_exported_set_is_rechecked_by_a_script_that_knows_nothing_of_vibench
     assert CliRunner().invoke(app, ["export", str(run), str(tmp_path / "set")]).exit_code != 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kib", "arguments"), [(0, ["export"]), (3, ["export"]), (1, ["replay"]), (8, ["report"])])
 def test_full_disks_leave_nothing(kib: int, arguments: list[str], run: Path, vibench: Vibench, tmp_path: Path) -> None:
     target = {"replay": [key(run), "--out", "one.npz"], "report": ["--no-figures", "--out", "one.html"]}

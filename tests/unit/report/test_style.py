@@ -56,6 +56,7 @@ def drawn(text: str, form: str = "svg") -> tuple[Figure, bytes]:
     return figure, stream.getvalue()
 
 
+@pytest.mark.long
 def test_a_label_is_drawn_as_it_is_whatever_the_settings_of_the_user() -> None:
     for text in LABELS:
         figure, svg = drawn(text)

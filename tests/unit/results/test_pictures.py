@@ -29,6 +29,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[tuple[str, Picture]
     return tuple(base.value_of(store, made))
 
 
+@pytest.mark.long
 def test_solutions_at_corners_and_middle_are_read(drawn: tuple[tuple[str, Picture], ...], tmp_path: Path) -> None:
     assert [title for title, _ in drawn] == [
         "scale = 0.8, centre_x = -0.05 m, centre_y = -0.05 m",

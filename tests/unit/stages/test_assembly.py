@@ -71,6 +71,7 @@ def wire(interpolation: float | None, problem: Plugin = WIRE) -> CellQueries:
     return replace(found, built=replace(found.built, enrichment=enrichment, pod=enrichment.pod, cone=enrichment.cone))
 
 
+@pytest.mark.long
 def test_rows_of_an_interpolated_problem(store: SampleStore) -> None:
     rows = value_of(store, CELLS["obstacle"])
     members = value_of(store, CELLS["obstacle"].built.reduction.decomposition)

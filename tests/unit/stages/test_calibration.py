@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import vibench
 from vibench.calibration.data import Prior, synthetic
@@ -30,6 +31,7 @@ def study(*task: str) -> vibench.Study:
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_every_ok_cell_has_chains_or_a_reason_also_where_the_task_is_added_later(tmp_path: Path) -> None:
     vibench.run(study(), tmp_path / "run", jobs=1, progress=False)
     assert read_table(tmp_path / "run" / "results.sqlite", "calibrations").empty

@@ -43,6 +43,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     return vibench.run(STUDY, tmp_path_factory.mktemp("compiled") / "run", progress=False, jobs=1)
 
 
+@pytest.mark.long
 def test_compiled_cells_have_the_rows_of_reduced_ones_and_are_no_solver(run: vibench.Run) -> None:
     cells = run.cells.set_index(["formulation", "solver"]).sort_index()
     assert list(cells.index) == [("compiled", "–"), ("mixed", "osqp"), ("mixed", "piqp")]
@@ -67,6 +68,7 @@ def test_compiled_cells_have_the_rows_of_reduced_ones_and_are_no_solver(run: vib
     assert (compared["solver_a"] != compared["solver_b"]).all()
 
 
+@pytest.mark.long
 def test_a_crash_costs_its_query_alone(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     heights = run.table("queries").groupby("query")["mu_1"].first().sort_values()
     crash = f"if (mu[0] > {heights.iloc[-2]:.17g}) __builtin_trap();"

@@ -12,7 +12,7 @@ from vibench.stages.cell_queries import CellQueries
 from vibench.study.parameter_sets import ParameterSet
 
 PROBLEMS = {
-    "obstacle": Plugin("problem", "obstacle", '{"resolution": 100}', "test"),
+    "obstacle": Plugin("problem", "obstacle", '{"resolution": 150}', "test"),
     "hertz": Plugin("problem", "hertz", '{"resolution": 200}', "test"),
 }
 PRIMALS = {"decorrelated": None, "online-supremizers": None, "offline-pga": 0.6}

@@ -24,7 +24,9 @@ from vibench.testing import solvers
 from vibench.testing.case import difference, find_jump
 from vibench.testing.checks import Check, Doubt, Note, Verdict
 
-SLOW = {"hertz3d": pytest.mark.long}
+SLOW = dict.fromkeys(
+    ("compiled", "greedy", "hertz3d", "infsup-greedy", "nmf", "regression", "tresca"), pytest.mark.long
+)
 
 BUILT_IN = [
     pytest.param(word, entry.name, marks=SLOW.get(entry.name, ()))

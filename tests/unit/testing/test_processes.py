@@ -39,6 +39,7 @@ def test_a_call_that_hangs_ends_the_checks_with_one_line(main: Main) -> None:
     assert out.splitlines()[-2].endswith(", time: no time is left")
 
 
+@pytest.mark.long
 def test_a_check_that_ends_its_process_costs_those_that_need_it() -> None:
     for plugin, cause in ((fake_plugins.Segfaults, "SIGSEGV"), (fake_plugins.Exits, "exit code 3")):
         findings = examined(plugin)
