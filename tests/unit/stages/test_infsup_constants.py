@@ -12,8 +12,8 @@ from vibench.stages.cell_queries import CellQueries
 from vibench.study.parameter_sets import ParameterSet
 
 PROBLEMS = {
-    "obstacle": Plugin("problem", "obstacle", '{"resolution": 150}', "test"),
-    "hertz": Plugin("problem", "hertz", '{"resolution": 200}', "test"),
+    "obstacle": Plugin("problem", "obstacle", '{"resolution": 200}', "test"),
+    "hertz": Plugin("problem", "hertz", '{"resolution": 300}', "test"),
 }
 PRIMALS = {"decorrelated": None, "online-supremizers": None, "offline-pga": 0.6}
 COUNT = 5
