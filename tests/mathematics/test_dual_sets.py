@@ -226,7 +226,7 @@ def test_bounded_multipliers_have_a_bound_without_a_correction(monkeypatch: pyte
     assert energy.norm(u - solution.u) <= bounds.u_energy < np.inf
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_what_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     vi, problem = small(1), Varying()
     disc = DualSet((Blocks(BlockKind.DISC, np.array([[0, 1]]), np.ones(1)),))
     with pytest.raises(UnsupportedError, match="the active set method knows rays and intervals; K has discs"):
@@ -238,5 +238,8 @@ def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(
         NumericalError, match=r"has rays as K, or other rows or radii of these; `problem.K` has intervals"
     ):
+        checked_assembly(problem, np.array([0.5]))
+    monkeypatch.setattr(problem, "assemble", lambda mu: replace(Varying().assemble(mu), K=problem.K))
+    with pytest.raises(NumericalError, match=r"does not declare: blocks = \(BlockKind.INTERVAL,\)"):
         checked_assembly(problem, np.array([0.5]))
     assert RAYS.blocks == ()

@@ -276,7 +276,7 @@ class Formulation(ABC):
     blocks: ClassVar[tuple[BlockKind, ...]] = ()
     """Kinds of blocks besides rays that the dual set K of a problem may have."""
     is_default: ClassVar[bool] = False
-    """Whether studies that name no formulation have this one; of all that are registered at most one."""
+    """Whether studies that name no formulation have this one, where no other default serves K with fewer `blocks`."""
 
     def build(self, offline: OfflinePhase) -> Mapping[str, Any]:  # noqa: ARG002
         """Data that the formulation adds to the offline phase, by default none; its seconds are recorded apart.

@@ -267,7 +267,8 @@ class Reduction:
         formulation = self.formulation
         # The default is found by its declaration: the core knows no formulation by name.
         if formulation is None:
-            formulation = registry.find(PluginKind.FORMULATION, registry.default_formulation()).create({})
+            name = registry.default_of(PluginKind.FORMULATION, self.problem.K.kinds)
+            formulation = registry.find(PluginKind.FORMULATION, name).create({})
         name = type(formulation).__qualname__
         uses = axes_of(formulation, f"formulation {name}")
         for axis, step, what in (("pod", self.modes, "modes"), ("dual", self.dual, "a dual strategy")):

@@ -38,6 +38,7 @@ class DualProgram(Formulation):
 
     uses: ClassVar[tuple[str, ...]] = ("pod", "dual", "primal", "solvers", "accuracy", "assembly")
     blocks = (BlockKind.INTERVAL,)
+    is_default = True
 
     def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:  # noqa: ARG002
         """The reduced model with the rows of its multipliers."""
