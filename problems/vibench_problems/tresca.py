@@ -79,7 +79,7 @@ class Tresca(Problem):
     """
 
     parameters = ParameterBox(
-        names=("half-width", "shift"), lower=np.array([0.5, -0.95]), upper=np.array([1.0, 0.95]), units=("m", "1")
+        names=("half_width", "shift"), lower=np.array([0.5, -0.95]), upper=np.array([1.0, 0.95]), units=("m", "1")
     )
     constant: ClassVar[frozenset[str]] = frozenset({"A", "f"})
     blocks = (BlockKind.INTERVAL,)
