@@ -116,7 +116,7 @@ def test_what_knows_contact_alone_says_so(coarse: Tresca, snapshots: Snapshots) 
     sizes = Stop(size=3), Stop(size=3)
     with pytest.raises(UnsupportedError, match="CPG knows λ ≥ 0 alone; K has intervals"):
         Reduction(coarse, CPG(), None, *sizes).given(snapshots=snapshots).cone  # noqa: B018
-    mixed = Reduction(coarse, PODDual(), None, *sizes).given(snapshots=snapshots)
+    mixed = Reduction(coarse, PODDual(), None, *sizes, formulation=Mixed()).given(snapshots=snapshots)
     with pytest.raises(UnsupportedError, match="the formulation Mixed knows λ ≥ 0 alone; K has intervals"):
         mixed.model.solve([0.8, 0.5])
     reduced = Reduction(coarse, PODDual(), None, *sizes, assembly="reduced").given(snapshots=snapshots)
