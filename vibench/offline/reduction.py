@@ -21,7 +21,7 @@ from vibench.linalg.inner_product import check_symmetric
 from vibench.model import hyperreduced
 from vibench.model.affine import INTERPOLATION_RTOL, AffineMember, affine_decomposition
 from vibench.model.certificates.base import CertificateBase, certificate_base
-from vibench.model.certificates.bounds import OnlineCertificate, prepare
+from vibench.model.certificates.bounds import OnlineCertificate, Solve, prepare
 from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, ReducedOperators
@@ -243,13 +243,16 @@ class Reduction:
         """Offline data shared by the certificates of all reduced models of the problem."""
         return certificate_base(self.problem, self.members, self.decomposed)
 
-    def certificate_of(self, reduced: AnyReducedModel) -> OnlineCertificate:
-        """The certificate of a reduced model (`docs/tolerances.md`); an `UnsupportedError` where none is possible."""
+    def certificate_of(self, reduced: AnyReducedModel, solve: Solve | None = None) -> OnlineCertificate:
+        """The certificate of a reduced model (`docs/tolerances.md`); an `UnsupportedError` where none is possible.
+
+        `solve` solves its reduced problems at training parameters where a QP solver for `program` does not.
+        """
         if not isinstance(reduced, HyperReducedModel):
             why = "as asked for" if self.assembly == "full" else self.operators
             needed = "a certificate at online cost needs reduced assembly"
             raise UnsupportedError(f"{needed}, and the model is assembled in full: {why}")
-        return prepare(reduced, self.members, self.certificate_base, self.decomposed)
+        return prepare(reduced, self.members, self.certificate_base, self.decomposed, solve)
 
     @cached_property
     def model(self) -> Model:
