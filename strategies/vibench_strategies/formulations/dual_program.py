@@ -19,7 +19,6 @@ from vibench import (
     QuerySettings,
     UnsupportedError,
     VariationalInequality,
-    solve_qp,
 )
 from vibench_strategies.formulations.reduced_programs import PhasesModel, solved
 
@@ -103,13 +102,7 @@ class DualProgramModel(PhasesModel):
 
     def certificate(self, offline: OfflinePhase) -> Any:
         """The certificate, of solutions of the dual program at training parameters."""
-        return offline.certificate_of(self.reduced, self._solved)
-
-    def _solved(self, mu: Array) -> tuple[Any, Array, Array] | None:
-        """The reduced problem at mu (d,) with x and α; `None` without a solution."""
-        settings = QuerySettings(1e-8, lambda program, **given: solve_qp(program, "daqp", 1e-8, **given))
-        answer = self.solve(mu, settings)
-        return None if answer.x is None or not np.isfinite(answer.x).all() else self.coordinates(mu, answer)
+        return offline.certificate_of(self.reduced, self)
 
 
 def reduced_rows(cone: Cone, K: DualSet) -> tuple[Array, Array]:
