@@ -13,6 +13,7 @@ from vibench.report.figures.style import styled
 
 OPTIONS = {
     "obstacle": {"resolution": "coarse"},
+    "obstacle-ceiling": {"resolution": "coarse", "ceiling": 0.01},
     "hertz": {"resolution": "coarse"},
     "hertz3d": {"resolution": "coarse"},
     "radial-obstacle": {},
@@ -26,7 +27,7 @@ def main() -> None:
     """Write a picture for every problem into the folder `gallery` beside this file."""
     folder = Path(__file__).with_name("gallery")
     for name, options in OPTIONS.items():
-        problem = create("problem", name, options)
+        problem = create("problem", "obstacle" if "ceiling" in options else name, options)
         box = problem.parameters
         mu = box.lower + 0.5 * (box.upper - box.lower)
         solution = HighFidelitySolver(problem).solve(mu)

@@ -89,6 +89,9 @@ class Obstacle(Problem):
     asymmetric
         Whether the nodes are displaced at random. The mesh and the training grid are symmetric otherwise, so that many
         steps of a greedy algorithm are ties between snapshots.
+    ceiling
+        Height [m] of a second obstacle over the first one, with which it moves: ψ ≤ u ≤ ψ + ceiling on ω̂, by two
+        families of rows, B and −B. The membrane touches both for heights up to about 0.015. `None` for no ceiling.
     bulge
         Whether there is a fourth parameter, mu_4 ∈ [−0.3, 0.3]; on ω̂ lengths then vary by factors from 0.7 to 1.3.
         Aspect ratios stay below 4.7 at "paper" and 8.2 at "fine", against 3.2 and 4.6 without a bulge.
@@ -112,12 +115,14 @@ class Obstacle(Problem):
         obstacle: float = -1.25,
         bulge: bool = False,
         asymmetric: bool = False,
+        ceiling: Annotated[float, Gt(0.0)] | None = None,
     ) -> None:
         nodes = NODES[resolution] if isinstance(resolution, str) else resolution
         self.load = load
         self.obstacle = obstacle
         self.bulge = bulge
-        self._options = length, load, obstacle, bulge, asymmetric
+        self.ceiling = ceiling
+        self._options = length, load, obstacle, bulge, asymmetric, ceiling
         if bulge:
             self.parameters = WITH_BULGE
         self.mesh = disc_in_square(nodes, RADIUS)
@@ -133,16 +138,25 @@ class Obstacle(Problem):
         self._assemble_disc(basis.with_elements("disc"))
 
     def _assemble_disc(self, disc: Basis) -> None:
-        """W, and B and g on ω̂ as sums over the monomials of the areas, the first of which is that of W."""
+        """W, and B and g on ω̂ as sums over the monomials of the areas, the first of which is that of W.
+
+        With a ceiling rows of u ≤ ψ + ceiling follow those of u ≥ ψ, with multipliers of their own.
+        """
         nodes, areas = self.disc_nodes, self._map.areas(self.mesh.t[:, disc.tind])
         densities = [np.repeat(ratio[:, None], disc.dx.shape[1], axis=1) for ratio in areas]
         densities[0] = np.ones_like(densities[0])
-        self.W = InnerProduct(fem.mass(disc)[nodes][:, nodes])
+        mass, sides = fem.mass(disc)[nodes][:, nodes], [-1.0] if self.ceiling is None else [-1.0, 1.0]
+        self.W = InnerProduct(sp.block_diag([mass] * len(sides), format="csr"))
         masses = [weighted_mass.assemble(disc, density=rho)[nodes][:, nodes] for rho in densities]
         integrals = [weighted_paraboloid.assemble(disc, density=rho)[nodes] for rho in densities]
         thetas = self._monomials  # one object: queries evaluate it once for both sums
-        on_disc = AffineSum(tuple(-sp.csr_array(term) for term in masses), thetas)
-        g = AffineSum(tuple(-self.obstacle * term for term in integrals), thetas)
+        on_disc = AffineSum(tuple(sp.csr_array(sp.vstack([side * term for side in sides])) for term in masses), thetas)
+        bounds = [[-self.obstacle * term for term in integrals]]
+        if self.ceiling is not None:
+            # The integrals of the multiplier functions are sums of the rows of a mass matrix.
+            lifts = [self.ceiling * np.asarray(term.sum(axis=1)).ravel() for term in masses]
+            bounds.append([lift - floor for lift, floor in zip(lifts, bounds[0], strict=True)])
+        g = AffineSum(tuple(np.concatenate(parts) for parts in zip(*bounds, strict=True)), thetas)
         unknowns = sp.csr_array((np.ones(len(nodes)), (np.arange(len(nodes)), self._contact_dofs)))
         unknowns.resize((len(nodes), len(self.free)))
         self._B_on_disc, self.affine = on_disc, {"B": on_disc.mapped(lambda term: term @ unknowns), "g": g}
@@ -178,7 +192,13 @@ class Obstacle(Problem):
         if self.nodes < NESTED:
             return None
         coarser = Obstacle(self.nodes // 4, *self._options)
-        return NestedStart(coarser, coarser.mesh.p[:, coarser.disc_nodes], self.mesh.p[:, self.disc_nodes])
+        return NestedStart(coarser, coarser._rows(), self._rows())
+
+    def _rows(self) -> Array:
+        """Places (3×m) of the constraints; the third coordinate tells the ceiling from the obstacle."""
+        disc = self.mesh.p[:, self.disc_nodes]
+        sides = range(1 if self.ceiling is None else 2)
+        return np.hstack([np.vstack([disc, np.full(disc.shape[1], float(side))]) for side in sides])
 
     @property
     def contact_dofs(self) -> Indices:
@@ -235,8 +255,12 @@ class Obstacle(Problem):
         """
         places = {"deflection": (0.35, 0.0), "left deflection": (-0.35, 0.0), "lower deflection": (0.0, -0.35)}
         return (
-            Output("contact force", "m", function=lambda mu, _, lam: float(self._integrals(mu) @ lam)),
-            Output("contact area", "m²", function=lambda mu, _, lam: float(self._integrals(mu) @ (lam > 0.0))),
+            Output("contact force", "m", function=lambda mu, _, lam: float(self._integrals(mu) @ self._pressure(lam))),
+            Output(
+                "contact area",
+                "m²",
+                function=lambda mu, _, lam: float(self._integrals(mu) @ (self._pressure(lam) != 0.0)),
+            ),
             *(Output(name, "m", u=self._at(place)) for name, place in places.items()),
         )
 
@@ -246,8 +270,12 @@ class Obstacle(Problem):
         return found
 
     def _integrals(self, mu: Array) -> Array:
-        """Integrals (m,) of the multiplier functions over the disc at mu."""
-        return -np.asarray(self.contact(mu).B.sum(axis=1)).ravel()
+        """Integrals (nodes of the disc,) of the multiplier functions over the disc at mu."""
+        return -np.asarray(self.contact(mu).B.sum(axis=1)).ravel()[: len(self.disc_nodes)]
+
+    def _pressure(self, lam: Array) -> Array:
+        """The pressure (nodes of the disc,) of the obstacle upwards, less that of the ceiling downwards."""
+        return lam if self.ceiling is None else lam[: len(self.disc_nodes)] - lam[len(self.disc_nodes) :]
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
         """The membrane's deflection on the mapped mesh and the contact pressure on the disc (paper, Figure 4)."""
@@ -255,7 +283,8 @@ class Obstacle(Problem):
         deflection[self.free] = u
         points = self.points(mu)
         disc = points[:, self.disc_nodes]
-        return Picture(points, self.mesh.t, deflection, "deflection u [m]", disc, lam, "multiplier λ [1/m]", "m")
+        pressure = self._pressure(lam)
+        return Picture(points, self.mesh.t, deflection, "deflection u [m]", disc, pressure, "multiplier λ [1/m]", "m")
 
     def diagnostics(self, mu: Array) -> Mapping[str, float]:
         """Largest aspect ratio of the mapped mesh (paper, Figure 3; 1 for equilateral triangles)."""

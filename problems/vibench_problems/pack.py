@@ -8,7 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from vibench import Array, Contact, Indices, Output, Picture, Problem, RequestError, Sampler, VariationalInequality
+from vibench import (
+    Array,
+    BlockKind,
+    Contact,
+    Indices,
+    Output,
+    Picture,
+    Problem,
+    RequestError,
+    Sampler,
+    VariationalInequality,
+)
 from vibench.packs import pack_digest, read_model_pack
 
 
@@ -21,6 +32,8 @@ class Pack(Problem):
         The folder; in a study file relative to that.
     """
 
+    blocks = (BlockKind.INTERVAL,)
+
     def __init__(self, path: Path) -> None:
         self._pack = pack = read_model_pack(path)
         if pack.V is None:
@@ -30,7 +43,7 @@ class Pack(Problem):
         self.parameters, self.V, self.W = pack.box, pack.V, pack.W
         # Declared by classes of other problems; here by what the folder holds.
         self.constant, self.entrywise = pack.constant, pack.entrywise  # type: ignore[misc]
-        self.affine = pack.affine
+        self.affine, self.K = pack.affine, pack.K
         self.licence = pack.manifest.license or "unknown"
 
     @classmethod

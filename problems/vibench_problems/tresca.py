@@ -13,6 +13,7 @@ from skfem import Basis, ElementQuad1, ElementVector, MeshQuad
 
 from vibench import (
     Array,
+    BlockKind,
     Contact,
     DualSet,
     Indices,
@@ -78,9 +79,10 @@ class Tresca(Problem):
     """
 
     parameters = ParameterBox(
-        names=("half-width", "shift"), lower=np.array([0.5, -0.95]), upper=np.array([1.0, 0.95]), units=("m", "1")
+        names=("half_width", "shift"), lower=np.array([0.5, -0.95]), upper=np.array([1.0, 0.95]), units=("m", "1")
     )
     constant: ClassVar[frozenset[str]] = frozenset({"A", "f"})
+    blocks = (BlockKind.INTERVAL,)
 
     def __init__(
         self,

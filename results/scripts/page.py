@@ -39,6 +39,7 @@ LIMITATIONS = {
     "three-dimensions": f"{ONE_MACHINE} One problem, a convex contact without friction, on the meshes named above; one factorisation.",  # noqa: E501
     "machines": "Two machines, both virtual with two cores; a host that is disturbed changes ratios of seconds, too. Tables of an earlier protocol stay until they are measured again.",  # noqa: E501
     "paper-figures": "Curves of the paper were not digitised: its statements are compared with our curves. Meshes and quadrature of the paper are not published, so that N, R and constants differ.",  # noqa: E501
+    "friction": f"{ONE_MACHINE} One problem on a mesh of medium size, with a closed form, and A constant. Discs, second-order cones and Coulomb's law have no models; corrected pairs of the dual program are made by this script and not by a study.",  # noqa: E501
     "exact-answers": "The problem has radial symmetry and a circular contact; rates of other problems are not shown.",
     "hertz-theory": "The theory assumes small deformations and half-planes, whereas the problem has discs of finite size: deviations of some per cent are due to the difference of the models, and not to the discretisation alone.",  # noqa: E501
 }

@@ -16,6 +16,7 @@ class HullGreedy(DualStrategy):
     """
 
     blocks = (BlockKind.INTERVAL,)
+    is_default = True
 
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
         """Chosen snapshots of unit norm, and their largest relative distances from the hull."""

@@ -9,6 +9,8 @@ from vibench.reduction import GrowingCone, subtract_cone_component
 class ModifiedCPG(DualStrategy):
     """mCPG, Algorithm 2 of Niakh, Drouet, Ehrlacher and Ern (2022)."""
 
+    is_default = True
+
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
         """Like CPG, but of each new snapshot θ only θ − Υ ≥ 0 becomes a generator, Υ the part already in the cone."""
         cone = GrowingCone(snapshots, W)

@@ -50,7 +50,7 @@ def test_axes_that_a_formulation_does_not_have_are_neither_repeated_nor_needed()
     tolerances: Any = [{"pod": [1e-3], "dual": [1e-2]}]
     content: Any = {"name": "one", "validation": 4, "problem": [Wire], "tolerances": tolerances}
     assert len(expand(Study(formulation=[Nearest], **content))) == 1
-    with pytest.raises(RequestError, match="dual: required, but not given"):
+    with pytest.raises(RequestError, match="primal: required, but not given"):
         Study(formulation=["mixed", Nearest], **content)
 
 

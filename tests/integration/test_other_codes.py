@@ -130,6 +130,24 @@ def test_a_block_in_space_of_freefem_has_the_pressure_of_uniform_compression(fre
         assert np.sqrt((exact.u - found.u) @ (A @ (exact.u - found.u))) <= found.bound.u_energy
 
 
+def test_friction_of_freefem_is_that_of_uniform_shear(freefem: Path) -> None:
+    """Where its bound is even, the traction is the shear modulus times the shift, or that bound; else parts slip."""
+    export_from_freefem(freefem, "tresca", "6")
+    pack = vibench.create("problem", "pack", {"path": str(freefem / "tresca")})
+    solver = vibench.HighFidelitySolver(pack)
+    for shift, bound in ((0.6, 1.2), (0.6, 0.8), (1.3, 0.9)):
+        lam = solver.solve(np.array([shift, bound, 0.0])).lam
+        np.testing.assert_allclose(lam, -min(shift / bound, 1.0), rtol=1e-10)
+    partly = solver.solve(np.array([0.9, 1.0, 0.4])).lam
+    assert 0 < np.count_nonzero(partly == -1.0) < len(partly)
+    # A study names nothing else: its strategies serve the friction.
+    section = vibench.create("dual strategy", "pod-dual"), vibench.create("primal strategy", "online-supremizers")
+    model = vibench.Reduction(pack, *section, vibench.Stop(1e-4), vibench.Stop(1e-3)).model
+    for mu in pack.parameters.sample(4, 7):
+        exact, found = solver.solve(mu), model.solve(mu)
+        assert pack.W.norm(exact.lam - found.lam) <= 0.02 * pack.W.norm(exact.lam)
+
+
 @pytest.mark.long
 def test_a_half_space_of_getfem_agrees_with_hertz(getfem: Path) -> None:
     """The force of an elliptic contact, up to what four cells along the zone and far faces that do not move cost."""

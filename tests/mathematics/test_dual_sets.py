@@ -226,7 +226,48 @@ def test_bounded_multipliers_have_a_bound_without_a_correction(monkeypatch: pyte
     assert energy.norm(u - solution.u) <= bounds.u_energy < np.inf
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_sets_without_active_sets_have_bounds_without_a_correction() -> None:
+    rng = np.random.default_rng(3)
+    K = DualSet((Blocks(BlockKind.DISC, np.array([[0, 1], [2, 3]]), np.array([0.5, 1.0])),))
+    A, B = sp.csr_array(spd(8, rng)), sp.csr_array(rng.standard_normal((4, 8)))
+    u, z = rng.standard_normal((2, 8))
+    lam = K.project(3.0 * z[:4])
+    vi = VariationalInequality(A, A @ u + B.T @ lam, B, B @ u - (3.0 * z[:4] - lam), K=K)
+    energy, V = EnergyNorm(A, CondensedStiffness(A)), InnerProduct(sp.csr_array(sp.eye_array(8)))
+    near, multiplier = u + 0.01 * z, K.project(0.99 * lam)
+    alpha = Constant(float(np.linalg.eigvalsh(A.toarray())[0]) * 0.99, proved=True)
+    bounds = bound_errors_at(V, vi, energy, alpha, Constant(0.0, proved=True), near, multiplier)
+    assert BoundNote.UNCORRECTED in bounds.note
+    assert energy.norm(near - u) <= bounds.u_energy < np.inf
+
+
+def test_another_set_is_a_class_of_its_own() -> None:
+    class Box(Blocks):
+        def support(self, values: Array) -> Array:
+            return np.asarray(np.abs(values[self.rows]).sum(axis=1))
+
+        def gauge(self, lam: Array) -> Array:
+            return np.asarray(np.abs(lam[self.rows]).max(axis=1))
+
+        def project(self, values: Array) -> Array:
+            return np.clip(values[self.rows], -1.0, 1.0)
+
+    given = BlockKind.OTHER, np.array([[3, 1]]), np.array([np.sqrt(2.0)])
+    K, intervals, y = (
+        DualSet((Box(*given),)),
+        DualSet.intervals(np.array([1, 3]), 1.0),
+        np.array([-1.0, 2.0, 0.0, -3.0]),
+    )
+    for name in ("support", "gauge", "project", "contains"):
+        assert np.array_equal(getattr(K, name)(y), getattr(intervals, name)(y))
+    assert K.gap(K.project(y), -y) == intervals.gap(K.project(y), -y) == 0.0
+    assert isinstance(K.of(np.array([1, 2, 3]), 4).blocks[0], Box)
+    assert DualSet((Blocks(BlockKind.DISC, *given[1:]),)) != K
+    with pytest.raises(RequestError, match="another set is a class of its own"):
+        Blocks(*given)
+
+
+def test_what_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     vi, problem = small(1), Varying()
     disc = DualSet((Blocks(BlockKind.DISC, np.array([[0, 1]]), np.ones(1)),))
     with pytest.raises(UnsupportedError, match="the active set method knows rays and intervals; K has discs"):
@@ -238,5 +279,8 @@ def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(
         NumericalError, match=r"has rays as K, or other rows or radii of these; `problem.K` has intervals"
     ):
+        checked_assembly(problem, np.array([0.5]))
+    monkeypatch.setattr(problem, "assemble", lambda mu: replace(Varying().assemble(mu), K=problem.K))
+    with pytest.raises(NumericalError, match=r"does not declare: blocks = \(BlockKind.INTERVAL,\)"):
         checked_assembly(problem, np.array([0.5]))
     assert RAYS.blocks == ()

@@ -12,7 +12,7 @@ from typer import Argument, Option
 from vibench.cli.completion import duals, problems
 from vibench.cli.console import echo
 from vibench.cli.plugin_commands import key_value
-from vibench.errors import NumericalError, RequestError
+from vibench.errors import NumericalError, RequestError, UnsupportedError
 from vibench.files import write_atomically
 from vibench.plugins.kinds import PluginKind
 
@@ -90,8 +90,8 @@ def _reduce_cones(folder: Path, dual: list[str], dual_tol: float, out: Path) -> 
         try:
             cone, other_error = reduce_multipliers(pack, find(PluginKind.DUAL, name).create({}), dual_tol)
         # One strategy that fails, as some do at small tolerances, leaves the others.
-        except NumericalError as error:
-            echo(f"failed: {name}: {error}")
+        except (NumericalError, UnsupportedError) as error:
+            echo(f"{'failed' if isinstance(error, NumericalError) else 'unavailable'}: {name}: {error}")
             continue
         steps += [(name, r, float(error)) for r, error in enumerate(cone.errors)]
         rows.append((name, cone.size, cone.errors[-1], other_error, len(cone.fallbacks)))
@@ -112,13 +112,15 @@ def _contents(pack: ModelPack) -> Iterator[str]:
     sizes = f"{pack.W.dim} multipliers" if pack.V is None else f"{pack.V.dim} unknowns, {pack.W.dim} multipliers"
     yield f"  {sizes}, {d} parameter{'s' * (d > 1)}: {', '.join(pack.box.names)}"
     yield from (f"  {name}: {member}" for name, member in pack.members.items())
+    yield from (f"  K: {len(block.rows)} of the multipliers in {block.kind.value}s" for block in pack.K.blocks)
     count = "drawn at random in the box" if pack.validation is None else f"{len(pack.validation)} listed"
     yield f"  training parameters: {len(pack.training)}, validation parameters: {count}"
     if pack.members:
         from vibench.packs.checks import solve_at_training, zero_rows_of
 
         mu, solution = solve_at_training(pack)
-        found = f"{int((solution.lam > 0.0).sum())} of {pack.W.dim} multipliers are positive"
+        inside = "between their bounds, or positive without" if pack.K.blocks else "positive"
+        found = f"{int(pack.K.free(solution.lam).sum())} of {pack.W.dim} multipliers are {inside}"
         yield f"  solved at mu = {mu.tolist()}: {found}, KKT residuals up to {solution.residuals.worst:.0e}"
         if len(zero := zero_rows_of(pack)):
             yield f"  {len(zero)} rows of B are zero at every listed parameter, the first is {zero[0]}"

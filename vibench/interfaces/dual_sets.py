@@ -7,14 +7,15 @@ contact, σ_K = 0 where B u ≤ g. The other blocks have
     disc      |λ| ≤ c      k rows       σ_K(y) = c |y|             the same in space, Bingham flow
     cone      |λ₁| ≤ λ₂    k + 1 rows   0 where |y₁| ≤ −y₂, or ∞   bounds of gradients, Coulomb's law in space
 
-where |·| is Euclidean and λ₂ is the last row of a cone. Rows and radii do not depend on the parameter. A bound c(mu)
-that does belongs into B and g: the multipliers θ = λ / c(mu) are then in one set ("Dual sets" in docs/mathematics.md).
+where |·| is Euclidean and λ₂ is the last row of a cone. Other bounded sets are classes of their own (see `Blocks`).
+Rows and radii do not depend on the parameter. A bound c(mu) that does belongs into B and g: the multipliers
+θ = λ / c(mu) are then in one set ("Dual sets" in docs/mathematics.md).
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from typing import Annotated
@@ -34,12 +35,17 @@ class BlockKind(StrEnum):
     INTERVAL = "interval"
     DISC = "disc"
     CONE = "cone"
+    OTHER = "other set"
 
 
 @bordered
 @dataclass(frozen=True)
 class Blocks:
-    """Blocks of one kind and size: their rows (b×k), and radii c > 0 (b,), which cones do not have."""
+    """Blocks of one kind and size: their rows (b×k), and radii c > 0 (b,), which cones do not have.
+
+    Any other bounded, closed convex set that contains zero is a class of its own, with `support`, `gauge` and `project`
+    of the kind `BlockKind.OTHER`; its radii are those of discs that contain the sets. Residuals and bounds know it.
+    """
 
     kind: BlockKind
     rows: Annotated[Indices, "b", "k"]
@@ -51,6 +57,8 @@ class Blocks:
             raise RequestError("rows in no block are rays: there are no blocks of them")
         if (self.radii is None) != (self.kind is BlockKind.CONE):
             raise RequestError("intervals and discs have radii, and cones have none")
+        if self.kind is BlockKind.OTHER and type(self) is Blocks:
+            raise RequestError("another set is a class of its own, with support, gauge and project")
         if self.radii is not None and not (np.isfinite(self.radii) & (self.radii > 0.0)).all():
             raise RequestError("a radius is not positive and finite; leave a row without friction out of B")
         if (self.kind is BlockKind.INTERVAL and size != 1) or (self.kind is BlockKind.CONE and size < 2):
@@ -63,6 +71,27 @@ class Blocks:
         if self.radii is None:
             return np.linalg.norm(inside[:, :-1], axis=1), inside[:, -1]
         return np.linalg.norm(inside, axis=1), self.radii
+
+    def support(self, values: Array) -> Array:
+        """σ (b,) of values (m,), infinite outside its domain."""
+        lengths, limits = self.parts(values)
+        return np.where(lengths <= -limits, 0.0, np.inf) if self.radii is None else np.asarray(limits * lengths)
+
+    def gauge(self, lam: Array) -> Array:
+        """The smallest γ ≥ 0 (b,) with λ (m,) in γ times a block; infinite where there is none."""
+        lengths, limits = self.parts(lam)
+        return np.where(lengths <= limits, 0.0, np.inf) if self.radii is None else np.asarray(lengths / limits)
+
+    def gap(self, lam: Array, slack: Array, error: Array, unit: float) -> float:
+        """An upper bound of the sum of σ(y) − λᵀy, see `DualSet.gap`; `unit` is a round-off of sums of two terms."""
+        bounded = self.radii is not None
+        own = np.einsum("bk,bk->b", lam[self.rows], slack[self.rows])
+        own += self.support(-slack) if bounded else 0.0
+        away = np.linalg.norm(error[self.rows], axis=1)
+        reach = np.linalg.norm(lam[self.rows], axis=1) + (self.radii if bounded else 0.0)
+        # `own` may be a small difference of terms with a round-off of their own
+        away += (4.0 + self.rows.shape[1]) * unit * np.linalg.norm(slack[self.rows], axis=1)
+        return float(np.sum(np.maximum(own, 0.0) + reach * away))
 
     def project(self, values: Array) -> Array:
         """The nearest points (b×k) of the blocks, in the Euclidean norm of the rows."""
@@ -125,24 +154,12 @@ class DualSet:
     def support(self, values: Array) -> float:
         """σ_K(y) of y (m,), infinite outside its domain."""
         total = np.inf if values[self.rays(len(values))].max(initial=0.0) > 0.0 else 0.0
-        for block in self.blocks:
-            lengths, limits = block.parts(values)
-            if block.radii is None:
-                total += 0.0 if (lengths <= -limits).all() else np.inf
-            else:
-                total += float(limits @ lengths)
-        return float(total)
+        return float(total + sum(float(np.sum(block.support(values))) for block in self.blocks))
 
     def gauge(self, lam: Array) -> float:
         """The smallest γ ≥ 0 with λ ∈ γ K for λ (m,); infinite where there is none."""
         largest = np.inf if lam[self.rays(len(lam))].min(initial=0.0) < 0.0 else 0.0
-        for block in self.blocks:
-            lengths, limits = block.parts(lam)
-            if block.radii is None:
-                largest = largest if (lengths <= limits).all() else np.inf
-            else:
-                largest = max(largest, float(np.max(lengths / limits, initial=0.0)))
-        return float(largest)
+        return float(max([largest, *(float(np.max(block.gauge(lam), initial=0.0)) for block in self.blocks)]))
 
     def contains(self, lam: Array) -> bool:
         """Whether λ (m,) is in K, without any round-off; not where one of them is no number."""
@@ -166,16 +183,8 @@ class DualSet:
         error = np.zeros_like(slack) if round_off is None else round_off
         # round-off may leave a negative product of numbers that vanish in pairs
         total = max(0.0, float(lam[rays] @ (slack + error)[rays]))
-        for block in self.blocks:
-            lengths, limits = block.parts(-slack)
-            own = np.einsum("bk,bk->b", lam[block.rows], slack[block.rows])
-            own += limits * lengths if block.radii is not None else 0.0
-            away = np.linalg.norm(error[block.rows], axis=1)
-            reach = np.linalg.norm(lam[block.rows], axis=1) + (limits if block.radii is not None else 0.0)
-            # `own` may be a small difference of terms with a round-off of their own
-            away += 0.0 if round_off is None else (4.0 + block.rows.shape[1]) * EPS * lengths
-            total += float(np.sum(np.maximum(own, 0.0) + reach * away))
-        return total
+        unit = 0.0 if round_off is None else EPS
+        return total + sum(block.gap(lam, slack, error, unit) for block in self.blocks)
 
     def free(self, lam: Array) -> Mask:
         """Rows inside their blocks, where B u = g: rays with λ > 0, intervals with |λ| < c, for λ (m,) or (m×P)."""
@@ -195,7 +204,7 @@ class DualSet:
         for block in self.blocks:
             inside = (place[block.rows] >= 0).all(axis=1)
             radii = None if block.radii is None else block.radii[inside]
-            kept += [Blocks(block.kind, place[block.rows[inside]], radii)] if inside.any() else []
+            kept += [replace(block, rows=place[block.rows[inside]], radii=radii)] if inside.any() else []
         return DualSet(tuple(kept))
 
     def names(self) -> str:
@@ -208,7 +217,10 @@ class DualSet:
             return False
         pairs = zip(self.blocks, other.blocks, strict=True)
         return all(
-            a.kind is b.kind and np.array_equal(a.rows, b.rows) and np.array_equal(a.radii, b.radii)  # type: ignore[arg-type]
+            type(a) is type(b)
+            and a.kind is b.kind
+            and np.array_equal(a.rows, b.rows)
+            and np.array_equal(a.radii, b.radii)  # type: ignore[arg-type]
             for a, b in pairs
         )
 

@@ -95,7 +95,7 @@ class _Steps(Protocol):
     def assembled(self) -> AssemblingModel: ...
     def given(self, **steps: Any) -> OfflinePhase: ...
     def enriched(self, primal: PrimalStrategy, tolerance: float | None) -> OfflinePhase: ...
-    def certificate_of(self, reduced: AssemblingModel) -> Certificate: ...
+    def certificate_of(self, reduced: AssemblingModel, answering: Any = None) -> Certificate: ...
 
 
 class OfflinePhase(_Steps, Protocol):
@@ -224,7 +224,7 @@ class FormulationModel(ABC):
     fallbacks: tuple[str, ...] = ()
     """One line for every step that deviates from the algorithm."""
     reduced: AssemblingModel
-    """The model that assembles `program`, of formulations that declare `has_program`."""
+    """The model that assembles `program`, of formulations that declare `has_program` or `has_certificate`."""
 
     @abstractmethod
     def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
@@ -245,6 +245,13 @@ class FormulationModel(ABC):
         `x` and `alpha` of answers are its solution, against which they are verified.
         """
         return self.reduced.assemble(mu)
+
+    def coordinates(self, mu: Array, answer: FormulationAnswer) -> tuple[Any, Array, Array]:
+        """The problem of `reduced` at mu (d,) with the x and α of an answer, for certificates without a `program`.
+
+        The pair of the answer is U = Z x and λ = χ α ∈ K.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has a certificate, and no program or coordinates")
 
     def certificate(self, offline: OfflinePhase) -> Certificate:
         """The certificate of `reduced`, prepared offline and timed, for formulations that declare `has_certificate`.
@@ -276,7 +283,7 @@ class Formulation(ABC):
     blocks: ClassVar[tuple[BlockKind, ...]] = ()
     """Kinds of blocks besides rays that the dual set K of a problem may have."""
     is_default: ClassVar[bool] = False
-    """Whether studies that name no formulation have this one; of all that are registered at most one."""
+    """Whether studies that name no formulation have this one, where no other default serves K with fewer `blocks`."""
 
     def build(self, offline: OfflinePhase) -> Mapping[str, Any]:  # noqa: ARG002
         """Data that the formulation adds to the offline phase, by default none; its seconds are recorded apart.

@@ -18,7 +18,7 @@ from vibench.errors import at_parameter
 from vibench.interfaces.absent_rows import settled_bounds, without_infinities
 from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.contact_source import ContactSource
-from vibench.interfaces.dual_sets import RAYS, DualSet
+from vibench.interfaces.dual_sets import RAYS, BlockKind, DualSet
 from vibench.interfaces.outputs import MeshFields, Output, Picture
 from vibench.interfaces.parameters import ParameterBox
 from vibench.linalg.factorisations import DEFAULT
@@ -148,6 +148,8 @@ class Problem(ABC):
     """Inner product of the multiplier space, X_W (m×m), in a basis whose nonnegative coefficients are the cone W⁺."""
     K: DualSet = RAYS
     """The set of the multipliers, which every assembly has; it does not depend on mu."""
+    blocks: ClassVar[tuple[BlockKind, ...]] = ()
+    """Kinds of blocks besides rays that K may have: studies that name none take strategies that serve them."""
     constant: ClassVar[Set[str]] = frozenset()
     """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu."""
     affine: Mapping[str, AffineSum] = MappingProxyType({})

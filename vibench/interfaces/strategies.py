@@ -112,6 +112,8 @@ class DualStrategy(Strategy, ABC):
 
     blocks: ClassVar[tuple[BlockKind, ...]] = ()
     """Kinds of blocks besides rays that K may have."""
+    is_default: ClassVar[bool] = False
+    """Whether studies that name no dual strategy have this one, where no other default serves K with fewer `blocks`."""
 
     @abstractmethod
     def reduce(self, snapshots: Annotated[Array, "m", "P"], W: Annotated[InnerProduct, "m"], stop: Stop) -> Cone:

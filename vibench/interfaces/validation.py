@@ -149,6 +149,9 @@ def checked_assembly(problem: Problem, mu: Annotated[Array, "d"]) -> Variational
     if vi.K != problem.K:
         found = f"the assembly at mu = {mu.tolist()} has {vi.K.names()} as K, or other rows or radii of these"
         raise NumericalError(f"{found}; `problem.K` has {problem.K.names()}, and both have to be equal")
+    if not vi.K.kinds <= set(problem.blocks):
+        written = ", ".join(f"BlockKind.{kind.name}" for kind in sorted(vi.K.kinds))
+        raise NumericalError(f"K has {vi.K.names()}, which the class does not declare: blocks = ({written},)")
     with at_parameter(mu):
         return settled(vi)
 

@@ -32,6 +32,7 @@ from vibench.arrays import Array, Mask
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import active_set_iterations
 from vibench.interfaces.absent_rows import is_absent
+from vibench.interfaces.dual_sets import BlockKind
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg import EPS, UNIT_ROUND_OFF
 from vibench.linalg.inner_product import InnerProduct
@@ -426,7 +427,8 @@ def find_correction(
     # multipliers 10⁸ times larger are those of dependent constraints, solved in round-off
     largest = 1e8 * max(np.max(lam, initial=0.0), alone)
     starts, doubtful = [chosen[kept] for chosen in (pressed, vi.K.free(lam)) if chosen is not None], None
-    for _ in range(4):
+    # Other blocks than intervals have no active sets: w = 0 serves.
+    for _ in range(4 if vi.K.kinds <= {BlockKind.INTERVAL} else 0):
         for values, forces in _minimisers(constraints, energy, lam, excess + margin, starts, largest):
             multipliers = np.zeros(len(vi.g))
             multipliers[kept] = forces

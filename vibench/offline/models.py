@@ -352,9 +352,17 @@ class Model:
             return self._program_solution(at, online.program(at), found, (0.0, seconds.cpu), settings)
         judged = model.status_of(at, answer, solver, 1.0)
         coefficients = judged.status, judged.reason, answer.x, answer.alpha, judged.residuals
+        bound = self.bound_of(at, answer) if judged.pair is not None else None
         own = None, settings.mode, answer.iterations, answer.uncertainty
         spent = seconds + judged.counted
-        return Solution(at, *coefficients, 0.0, spent.cpu, self, lambda: judged.pair, None, None, *own)
+        return Solution(at, *coefficients, 0.0, spent.cpu, self, lambda: judged.pair, bound, settings.tolerance, *own)
+
+    def bound_of(self, mu: Array, answer: FormulationAnswer) -> OnlineBound | None:
+        """The bound at mu (d,) of an answer that is no solution of a program; `None` without a certificate."""
+        if self.certificate is None:
+            return None
+        given = self.online.coordinates(mu, answer)
+        return self.certificate.certify(self.problem, mu, *given, CorrectionMode.NONE)[0]
 
     def _solution(self, at: Array, assembled: ReducedProblem, assembly: float, settings: _Settings) -> Solution:
         assert settings.solver is not None  # `solves_programs`

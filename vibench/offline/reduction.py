@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal, TypeAlias, get_type_hints
 
 import numpy as np
@@ -14,7 +14,7 @@ from vibench.errors import NumericalError, RequestError, UnsupportedError, messa
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces import strategies, validation
 from vibench.interfaces.dual_sets import refuse_blocks
-from vibench.interfaces.formulations import Formulation, Snapshots, axes_of
+from vibench.interfaces.formulations import Formulation, FormulationModel, QuerySettings, Snapshots, axes_of
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import AdaptiveSampling, Cone, DualStrategy, PrimalStrategy, Sampling, Stop
 from vibench.linalg.inner_product import check_symmetric
@@ -25,7 +25,7 @@ from vibench.model.certificates.bounds import OnlineCertificate, prepare
 from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, ReducedOperators
-from vibench.offline.models import Model, check_built
+from vibench.offline.models import CellSolver, Model, check_built
 from vibench.plugins import registry
 from vibench.plugins.kinds import PluginKind
 from vibench.reduction.pod import POD, pod
@@ -243,13 +243,17 @@ class Reduction:
         """Offline data shared by the certificates of all reduced models of the problem."""
         return certificate_base(self.problem, self.members, self.decomposed)
 
-    def certificate_of(self, reduced: AnyReducedModel) -> OnlineCertificate:
-        """The certificate of a reduced model (`docs/tolerances.md`); an `UnsupportedError` where none is possible."""
+    def certificate_of(self, reduced: AnyReducedModel, answering: FormulationModel | None = None) -> OnlineCertificate:
+        """The certificate of a reduced model (`docs/tolerances.md`); an `UnsupportedError` where none is possible.
+
+        `answering` is the model whose answers it bounds, where they are no solutions of programs.
+        """
         if not isinstance(reduced, HyperReducedModel):
             why = "as asked for" if self.assembly == "full" else self.operators
             needed = "a certificate at online cost needs reduced assembly"
             raise UnsupportedError(f"{needed}, and the model is assembled in full: {why}")
-        return prepare(reduced, self.members, self.certificate_base, self.decomposed)
+        solve = None if answering is None else partial(_answer_in_coordinates, answering)
+        return prepare(reduced, self.members, self.certificate_base, self.decomposed, solve)
 
     @cached_property
     def model(self) -> Model:
@@ -267,7 +271,8 @@ class Reduction:
         formulation = self.formulation
         # The default is found by its declaration: the core knows no formulation by name.
         if formulation is None:
-            formulation = registry.find(PluginKind.FORMULATION, registry.default_formulation()).create({})
+            name = registry.default_of(PluginKind.FORMULATION, self.problem.K.kinds)
+            formulation = registry.find(PluginKind.FORMULATION, name).create({})
         name = type(formulation).__qualname__
         uses = axes_of(formulation, f"formulation {name}")
         for axis, step, what in (("pod", self.modes, "modes"), ("dual", self.dual, "a dual strategy")):
@@ -292,3 +297,9 @@ class Reduction:
         names = {name for name, value in vars(Reduction).items() if isinstance(value, cached_property)} - {"model"}
         steps = {name: value for name, value in self.__dict__.items() if name in names}
         return replace(self, formulation=formulation).given(**self.__dict__.get("_given", {}) | steps)
+
+
+def _answer_in_coordinates(model: FormulationModel, mu: Array) -> tuple[Any, Array, Array] | None:
+    """The reduced problem at mu (d,) with the x and α of the answer of a model; `None` without one."""
+    answer = model.solve(mu, QuerySettings(1e-8, CellSolver("daqp", 1e-8)))
+    return None if answer.x is None or not np.isfinite(answer.x).all() else model.coordinates(mu, answer)

@@ -12,8 +12,10 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError, at_parameter, placed
 from vibench.highfidelity.active_set import HighFidelitySolution, solve_high_fidelity
-from vibench.interfaces.absent_rows import settled_bounds, zero_rows
+from vibench.interfaces.absent_rows import zero_rows
+from vibench.interfaces.dual_sets import DualSet
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
+from vibench.interfaces.validation import settled
 from vibench.linalg.inner_product import asymmetry, check_positive_definite
 from vibench.packs.manifest import read_manifest
 from vibench.packs.pack import ModelPack, PackSolutions
@@ -63,10 +65,13 @@ def _check(pack: ModelPack) -> float | None:
     solved = pack.V is not None and reference.u is not None
     numbers = range(len(reference.parameters)) if solved else ()
     residuals = [_Solution.from_pack(pack, reference, k).residual for k in numbers]
-    # Negative entries up to 1e-8 of the largest one are round-off.
-    if reference.lam.min() < -1e-8 * np.abs(reference.lam).max():
+    # Up to 1e-8 of the largest entry are round-off.
+    outside = np.array([_outside(pack.K, column) for column in reference.lam.T])
+    if outside.max() > 1e-8 * np.abs(reference.lam).max():
         if solved:
-            raise _explained(pack, reference, int(np.argmin(reference.lam.min(axis=0))))
+            raise _explained(pack, reference, int(np.argmax(outside)))
+        if pack.K.blocks:
+            raise RequestError(f"solutions.lam leaves K by {outside.max():.1e}: in K are {pack.K.names()}")
         # Without a solution u there is nothing that would explain them.
         if reference.lam.max() <= 1e-8 * np.abs(reference.lam).max():
             raise RequestError("solutions.lam is negative: λ has the other sign, it is −λ that is nonnegative")
@@ -78,6 +83,11 @@ def _check(pack: ModelPack) -> float | None:
         if not residual <= reference.tolerance:
             raise _explained(pack, reference, k)
     return max(residuals, default=None)
+
+
+def _outside(K: DualSet, lam: Array) -> float:
+    """The largest coefficient of λ (m,) less the nearest point of K."""
+    return float(np.max(np.abs(lam - K.project(lam)), initial=0.0))
 
 
 def _check_operators(pack: ModelPack, X_V: Any) -> None:
@@ -99,7 +109,7 @@ def _check_operators(pack: ModelPack, X_V: Any) -> None:
     # A zero row of B must not have a negative bound.
     for mu in listed:
         with at_parameter(mu):
-            settled_bounds(B.at(mu), pack.members["g"].at(mu))
+            settled(pack.at(mu))
     # Three samples: a run checks the definiteness of A wherever it solves.
     for mu in listed[np.linspace(0, len(listed) - 1, 3).round().astype(int)]:
         matrix = A.at(mu)
@@ -144,11 +154,11 @@ class _Solution:
 
     @property
     def residual(self) -> float:
-        """The largest relative KKT residual; infinite for λ outside W⁺."""
-        # As in `_check`: smaller negative entries are round-off.
-        if self.lam.min(initial=0.0) < -1e-8 * np.abs(self.lam).max(initial=0.0):
+        """The largest relative KKT residual; infinite for λ outside K."""
+        # As in `_check`: what is less far outside is round-off.
+        if _outside(self.vi.K, self.lam) > 1e-8 * np.abs(self.lam).max(initial=0.0):
             return float("inf")
-        return kkt_residuals(self.vi, self.u, np.maximum(self.lam, 0.0)).worst
+        return kkt_residuals(self.vi, self.u, self.vi.K.project(self.lam)).worst
 
     def change(self, **factors: float) -> _Solution:
         """A copy with members, u or lam multiplied by factors."""
@@ -183,7 +193,8 @@ def _explained(pack: ModelPack, given: PackSolutions, k: int) -> RequestError:
     for other, mu in enumerate(given.parameters):
         if other != k and replace(solution, vi=pack.at(mu)).residual <= tolerance:
             return RequestError(f"{title}, but that of parameter {other}: the columns are in another order")
-    residuals = kkt_residuals(solution.vi, solution.u, np.maximum(solution.lam, 0.0))
-    parts = {"B u ≤ g": residuals.primal, "A u + Bᵀλ = f": residuals.dual, "λᵀ(B u − g) = 0": residuals.gap}
+    residuals = kkt_residuals(solution.vi, solution.u, solution.vi.K.project(solution.lam))
+    of_gap = "σ_K(B u − g) = λᵀ(B u − g)" if pack.K.blocks else "λᵀ(B u − g) = 0"
+    parts = {"B u ≤ g": residuals.primal, "A u + Bᵀλ = f": residuals.dual, of_gap: residuals.gap}
     worst = max(parts, key=lambda name: parts[name])
     return RequestError(f"{title}: {worst} is violated by {parts[worst]:.1e} relatively; accepted: {tolerance:g}")

@@ -108,6 +108,14 @@ class Operators(_Table):
     ] = None
 
 
+class Block(_Table):
+    """Rows whose multipliers are bounded, |λ| ≤ c, as for friction; the others are contact, λ ≥ 0."""
+
+    kind: Annotated[Literal["interval"], Field(description="Kind of the rows.")]
+    rows: Annotated[str | None, Field(description="Their indices (k,); by default all rows.")] = None
+    radius: Annotated[str | Finite, Field(description="The c > 0: a number, or an array (k,).")]
+
+
 class Solutions(_Table):
     """Reference solutions, one column per parameter."""
 
@@ -157,6 +165,7 @@ class Manifest(_Table):
     parameters: Annotated[Parameters, Field(description="The parameters, their box, and sets of them.")]
     spaces: Annotated[Spaces, Field(description="The inner products.")]
     operators: Annotated[Operators | None, Field(description="Without them the pack has its dual half only.")] = None
+    K: Annotated[list[Block], Field(description="Rows with bounded multipliers.")] = []
     solutions: Annotated[Solutions | None, Field(description="Reference solutions, which show signs.")] = None
     mesh: Annotated[Mesh | None, Field(description="A mesh, for pictures.")] = None
     outputs: Annotated[list[LinearOutput], Field(description="Quantities of interest.")] = []
@@ -173,7 +182,7 @@ def references(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[str, s
     # Keys whose texts refer to files.
     elif isinstance(value, str) and place[-1] in {
         "X_V", "X_W", "free", "contact", "integrals", "constant", "each", "table", "array", "u", "lam", "file",
-        "points", "unknowns", "positions",
+        "points", "unknowns", "positions", "rows", "radius",
     }:  # fmt: skip
         yield ".".join(name for name in place if name not in ("constant", "array")), value
 

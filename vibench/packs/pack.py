@@ -13,6 +13,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.affine import AffineSum, Expression, Thetas, entries_of
+from vibench.interfaces.dual_sets import RAYS, DualSet, refuse_blocks
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
@@ -21,7 +22,7 @@ from vibench.interfaces.validation import check_cone
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import decomposed, held_out_error
 from vibench.packs.manifest import Manifest
-from vibench.reduction.cones import project_on_cone
+from vibench.reduction.cones import hull_distances, project_on_cone
 
 
 class Listing(NamedTuple):
@@ -158,6 +159,8 @@ class ModelPack:
         Reference solutions, or `None`, and their largest KKT residual, `None` without, or without operators or u.
     mesh, outputs
         Data of pictures, or `None`; quantities of interest.
+    K
+        Set of the multipliers.
     """
 
     manifest: Manifest
@@ -173,6 +176,7 @@ class ModelPack:
     mesh: PackMesh | None
     outputs: tuple[Output, ...] = ()
     residual: float | None = None
+    K: DualSet = RAYS
 
     @property
     def listed(self) -> Array:
@@ -218,7 +222,7 @@ class ModelPack:
 
     def at(self, mu: Array) -> VariationalInequality:
         """The variational inequality at mu (d,); a `NumericalError` if mu has to be listed, or θ(µ) is not finite."""
-        return VariationalInequality(**{name: self.members[name].at(mu) for name in MEMBERS})
+        return VariationalInequality(**{name: self.members[name].at(mu) for name in MEMBERS}, K=self.K)
 
     def validation_set(self, count: int, seed: int) -> Array:
         """Validation parameters, the first listed ones or random ones; a `NumericalError` if fewer are listed."""
@@ -238,14 +242,18 @@ def pack_multipliers(pack: ModelPack) -> tuple[Array, Array]:
     training = np.array([tuple(mu) in of_training for mu in pack.reference.parameters.tolist()])
     if not training.any():
         raise RequestError("none of the parameters of the solutions is a training parameter")
-    # Negative entries are round-off, as the checks of the pack have found.
-    lam = np.maximum(pack.reference.lam, 0.0)
+    # What is outside is round-off, as the checks of the pack have found.
+    lam = np.column_stack([pack.K.project(column) for column in pack.reference.lam.T])
     return lam[:, training], lam[:, ~training]
 
 
 def reduce_multipliers(pack: ModelPack, strategy: DualStrategy, tolerance: float) -> tuple[Cone, float | None]:
     """A cone of the multipliers at training parameters, and its largest error at others by the largest norm."""
     training, others = pack_multipliers(pack)
-    cone = check_cone(strategy.reduce(training, pack.W, Stop(tolerance=tolerance)), pack.W)
-    distances = [project_on_cone(cone.rays, column, pack.W).distance for column in others.T]
-    return cone, float(max(distances) / pack.W.norm(training).max()) if distances else None
+    refuse_blocks(pack.K, strategy.blocks, f"the dual strategy {type(strategy).__name__}")
+    cone = check_cone(strategy.reduce(training, pack.W, Stop(tolerance=tolerance)), pack.W, pack.K)
+    if cone.gauges is None:
+        distances = np.array([project_on_cone(cone.rays, column, pack.W).distance for column in others.T])
+    else:
+        distances = hull_distances(pack.W.whiten(cone.generators / cone.gauges), pack.W.whiten(others))
+    return cone, float(distances.max() / pack.W.norm(training).max()) if len(distances) else None

@@ -20,6 +20,7 @@ from vibench.errors import NumericalError, RequestError, placed
 from vibench.files import file_digest
 from vibench.interfaces.absent_rows import without_infinities
 from vibench.interfaces.affine import Expression, normal_names
+from vibench.interfaces.dual_sets import BlockKind, Blocks, DualSet
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import MEMBERS
@@ -93,6 +94,9 @@ class PackReader:
         V = None if operators is None or spaces.X_V is None else self._primal_space(spaces.X_V)
         n, m = 0 if V is None else V.dim, W.dim
         members = {} if operators is None else self._members(operators, n, m)
+        blocks = tuple(self._block(block, f"K.{k}", m) for k, block in enumerate(self._manifest.K))
+        with placed("K"):
+            K = DualSet(blocks)
         if not all(member.everywhere for member in members.values()):
             if validation is None:
                 why = "since arrays or tables are given at listed parameters only"
@@ -112,6 +116,7 @@ class PackReader:
                 None if one.u is None else self._kept(self._vector(one.u, f"outputs.{k}.u", self._all)),
                 None if one.lam is None else self._vector(one.lam, f"outputs.{k}.lam", m),
             ) for k, one in enumerate(outputs)),
+            K=K,
         )  # fmt: skip
 
     def _domain(self, given: schema.Parameters) -> tuple[Array, Array | None, ParameterBox]:
@@ -227,6 +232,14 @@ class PackReader:
             expected = f"{rows}×{'P' if count is None else count}, a column per parameter"
             raise RequestError(f"{what}: an array {size_of(columns.shape)}; expected {expected}{transposed}")
         return columns
+
+    def _block(self, given: schema.Block, what: str, m: int) -> Blocks:
+        rows = np.arange(m) if given.rows is None else self._files.indices(given.rows, f"{what}.rows", m)
+        radii = np.full(len(rows), given.radius) if isinstance(given.radius, float) else None
+        if isinstance(given.radius, str):
+            radii = self._vector(given.radius, f"{what}.radius", len(rows))
+        with placed(what):
+            return Blocks(BlockKind(given.kind), rows[:, None], radii)
 
     def _contact(self, members: Mapping[str, PackMember], n: int) -> Indices:
         touched = np.zeros(n, dtype=bool)

@@ -15,6 +15,7 @@ from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.files import scratch
 from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.dual_sets import BlockKind, refuse_blocks
 from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
 from vibench.packs.manifest import FILE
@@ -36,18 +37,20 @@ def write_pack(
         lines += ["[parameters]", f"names = [{names}]", f"units = [{units}]"]
         lines += [f"lower = {box.lower.tolist()}", f"upper = {box.upper.tolist()}"]
         lines += [f'{role} = "parameters.npz:{role}"' for role in ("training", "validation")] + [""]
-        lines += _space_table(problem, part) + _operator_table(problem, listed, part)
+        lines += _space_table(problem, part) + _operator_table(problem, listed, part) + _dual_set_tables(problem, part)
         if solutions:
             exact = list(map(HighFidelitySolver(problem).solve, listed))
             u, lam = (np.column_stack([getattr(one, name) for one in exact]) for name in ("u", "lam"))
             _save(part / "solutions.npz", {"u": u, "lam": lam})
             lines += ["[solutions]", 'u = "solutions.npz:u"', 'lam = "solutions.npz:lam"', ""]
         lines += _output_tables(problem, part)
-        explanation = (
-            "# u = argmin ½ uᵀA u − fᵀu subject to B u ≤ g, with A u + Bᵀλ = f and λ ≥ 0, on the free unknowns.\n"
-            "# Listed parameters are numbered from 0: those of the training set, then those of the validation set.\n"
-        )
-        (part / FILE).write_text(explanation + "\n".join(lines) + "\n", encoding="utf-8")
+        explanation = [
+            "# u = argmin ½ uᵀA u − fᵀu subject to B u ≤ g, with A u + Bᵀλ = f and λ ≥ 0, on the free unknowns.",
+            "# Listed parameters are numbered from 0: those of the training set, then those of the validation set.",
+        ]
+        if problem.K.blocks:
+            explanation.insert(1, "# Rows of K are no inequalities: |λ| ≤ radius there, and λ maximises λᵀ(B u − g).")
+        (part / FILE).write_text("\n".join([*explanation, *lines]) + "\n", encoding="utf-8")
 
 
 @contextlib.contextmanager
@@ -100,6 +103,19 @@ def _operator_table(problem: Problem, listed: Array, part: Path) -> list[str]:
         _save(part / f"{name}.npz", arrays[name])
         lines.append(line)
     return [*lines, ""]
+
+
+def _dual_set_tables(problem: Problem, part: Path) -> list[str]:
+    """The tables of the rows whose multipliers are bounded."""
+    refuse_blocks(problem.K, [BlockKind.INTERVAL], "a pack")
+    lines: list[str] = []
+    arrays: dict[str, Any] = {}
+    for k, block in enumerate(problem.K.blocks):
+        arrays |= {f"rows{k}": block.rows[:, 0], f"radius{k}": block.radii}
+        lines += ["[[K]]", 'kind = "interval"', f'rows = "K.npz:rows{k}"', f'radius = "K.npz:radius{k}"', ""]
+    if arrays:
+        _save(part / "K.npz", arrays)
+    return lines
 
 
 def _output_tables(problem: Problem, part: Path) -> list[str]:

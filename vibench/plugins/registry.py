@@ -10,7 +10,7 @@ import ast
 import importlib.metadata
 import importlib.util
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -24,6 +24,7 @@ from vibench.plugins.kinds import PluginKind
 from vibench.provenance import distribution_version, package_hash, solver_version
 
 if TYPE_CHECKING:
+    from vibench.interfaces.dual_sets import BlockKind
     from vibench.plugins.options import Option
     from vibench.qp.verification import QPSolver
 
@@ -224,20 +225,40 @@ def registered(kind: PluginKind) -> dict[str, RegisteredPlugin]:
 @cache
 def default_formulation() -> str:
     """Name of the formulation of studies that name none, whose class says `is_default = True`; "" without any."""
-    # The class is read, not imported: results are shown by this name. Raises a `RequestError` if there are several.
-    unique = {name: one.entries[0] for name, one in registered(PluginKind.FORMULATION).items() if not one.conflict}
-    names = [name for name, entry in unique.items() if _is_default(entry.module, entry.attr)]
+    return default_of(PluginKind.FORMULATION)
+
+
+def default_of(kind: PluginKind, blocks: Set[BlockKind] = frozenset()) -> str:
+    """Name of the default formulation or dual strategy for sets K with these kinds of blocks; "" without any.
+
+    Of those that serve K it is the one that knows fewest kinds; if none does, it is the one for rays, which says so.
+    Raises a `RequestError` if there are several.
+    """
+    # Classes are read, and imported only where K has blocks: results are shown by the name of the default.
+    unique = {name: one.entries[0] for name, one in registered(kind).items() if not one.conflict}
+    declared = {name: _declared(entry.module, entry.attr) for name, entry in unique.items()}
+    known = {name: len(getattr(own.get("blocks"), "elts", ())) for name, own in declared.items() if _is_default(own)}
+    serving = [name for name in known if not blocks or blocks <= set(find(kind, name).load().blocks)]
+    fewest = min((known[name] for name in serving), default=0)
+    names = [name for name in serving if known[name] == fewest]
     if len(names) > 1:
-        raise RequestError(f"several formulations say that they are the default: {', '.join(names)}")
-    return names[0] if names else ""
+        raise RequestError(f"several plugins say that they are the default {kind}: {', '.join(names)}")
+    return names[0] if names else default_of(kind) if blocks else ""
 
 
-def _is_default(module: str, name: str) -> bool:
+def _is_default(declared: Mapping[str, ast.expr]) -> bool:
+    own = declared.get("is_default")
+    return isinstance(own, ast.Constant) and own.value is True
+
+
+def _declared(module: str, name: str) -> dict[str, ast.expr]:
+    """The attributes that a class assigns in its body, as they are written."""
+    found: dict[str, ast.expr] = {}
     for node in next(_definitions(module, name), ast.ClassDef(name, [], [], [], [])).body:
         target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
-        if isinstance(target, ast.Name) and target.id == "is_default":
-            return isinstance(node.value, ast.Constant) and node.value.value is True  # type: ignore[attr-defined]
-    return False
+        if isinstance(target, ast.Name) and isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            found[target.id] = node.value
+    return found
 
 
 def find_named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str]) -> RegisteredPlugin:

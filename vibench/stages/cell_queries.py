@@ -32,7 +32,7 @@ from vibench.stability.coercivity import Constant, Stability
 from vibench.stability.infsup import InfSup, stability_ratio
 from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, ReducedPrograms
-from vibench.stages.assessment import error_columns, pair_columns, refutation, summarise
+from vibench.stages.assessment import error_columns, online_columns, pair_columns, refutation, summarise
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, TimeLimit, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage, spaces_of
 from vibench.stages.formulation import CertificateStage, FormulationStage
@@ -272,7 +272,10 @@ class _Queries(Items):
         pairs = [self._model.pair(mu, answer) for mu, answer in zip(mus, answers, strict=True)]
         u, lam = (np.column_stack(columns) for columns in zip(*pairs, strict=True))
         vis = [assemblies(self._problem).at(mu) for mu in mus]
-        return pair_columns(self._problem, mus, vis, u, lam, compared, constants)
+        rows = pair_columns(self._problem, mus, vis, u, lam, compared, constants)
+        certified = replace(self._model, certificate=self._certificate)
+        bounds = [certified.bound_of(mu, answer) for mu, answer in zip(mus, answers, strict=True)]
+        return [row | (online_columns(one, row) if one else {}) for row, one in zip(rows, bounds, strict=True)]
 
     def _known(self, number: int) -> Row:
         """The columns of a query that do not depend on its solution: parameter, zeros of the reference, constants."""

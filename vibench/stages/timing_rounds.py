@@ -10,6 +10,7 @@ from statistics import fmean, median
 import numpy as np
 
 from vibench.arrays import Array, Indices
+from vibench.interfaces.formulations import FormulationAnswer
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.bounds import OnlineCertificate
@@ -194,26 +195,30 @@ class _Rounds(Items):
                 reconstruct[k] = judged.reconstruction
                 solve[k] += judged.counted
             if certified and answer.x is not None and answer.alpha is not None:
-                certify[k] = self._certified(stage, queries, near, (query.in_model(answer.x), answer.alpha))
+                certify[k] = self._certified(stage, queries, near, query.in_model(answer.x), answer.alpha)
             # A slow solver ends its part of a round after 5 s, so that the cells keep alternating.
             if sum(seconds.wall for seconds in solve.values()) > 5.0:
                 break
         return assemble, solve, certify, reconstruct
 
-    def _certified(self, stage: CellQueries, queries: Queries, near: Array, solution: tuple[Array, Array]) -> Seconds:
+    def _certified(self, stage: CellQueries, queries: Queries, near: Array, x: Array, alpha: Array) -> Seconds:
         """Seconds of the certificate and the correction of a solution at a parameter."""
-        model = queries.model.reduced
+        model = queries.model.online.reduced
         # Without certificate the correction takes high-fidelity matrices, which a full assembly has made already.
         if stage.certificate is None:
             factors = self._factors.setdefault(stage.built.key, Assemblies(model.problem))
             vi, assembly = timed(lambda: checked_assembly(model.problem, near).copy())
-            _, seconds = timed(partial(corrected_in_full, model, factors, near, vi, *solution))
+            _, seconds = timed(partial(corrected_in_full, model, factors, near, vi, x, alpha))
             return assembly + seconds if isinstance(model, HyperReducedModel) else seconds
         key = stage.certificate.key
         if key not in self._certificates:
             self._certificates[key] = stage.certificate.certificate(self._store)
         assert isinstance(model, HyperReducedModel)  # others have no certificates
-        query = model.problem, near, model.assemble(near), *solution
+        if not stage.built.kind.has_program:
+            given = queries.model.online.coordinates(near, FormulationAnswer(x, alpha))
+        else:
+            given = model.assemble(near), x, alpha
+        query = model.problem, near, *given
         return timed(partial(self._certificates[key].certify, *query, stage.correction))[1]
 
     def _queries(self, stage: CellQueries) -> Queries:

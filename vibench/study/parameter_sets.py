@@ -12,6 +12,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, VibenchError, foreign, placed
+from vibench.interfaces.dual_sets import BlockKind
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import AdaptiveSampling, Sampling
 from vibench.interfaces.validation import training_parameters, validation_parameters
@@ -84,6 +85,12 @@ OWN_TRAINING = ParameterSet("training", 0, 0)
 def is_available(*plugins: Plugin) -> bool:
     """Whether plugins are available here: their names are unambiguous, and their requirements installed."""
     return not any(plugin.registered.conflict or plugin.registered.missing for plugin in plugins)
+
+
+def blocks_of(problem: Plugin) -> frozenset[BlockKind]:
+    """Kinds of blocks besides rays of a problem's K; it is built where its class declares any, if it is installed."""
+    declared = is_available(problem) and problem.registered.load().blocks
+    return _problem(problem).K.kinds if declared else frozenset()
 
 
 @lru_cache(maxsize=4)

@@ -26,16 +26,17 @@ from pydantic import (
 )
 
 from vibench.errors import RequestError, fault_line, unknown_name
+from vibench.interfaces.dual_sets import BlockKind
 from vibench.interfaces.formulations import Formulation, axes_of
 from vibench.interfaces.strategies import Stop
 from vibench.linalg.factorisations import DEFAULT
 from vibench.model.affine import INTERPOLATION_RTOL
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import GivenPlugin, Plugin, give
-from vibench.plugins.registry import RegisteredPlugin, default_formulation, find, registered
+from vibench.plugins.registry import RegisteredPlugin, default_formulation, default_of, find, registered
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
-from vibench.study.parameter_sets import OWN, ParameterSet, check_sets, is_available
+from vibench.study.parameter_sets import OWN, ParameterSet, blocks_of, check_sets, is_available
 from vibench.timing import FEWEST_ROUNDS
 
 Size: TypeAlias = Annotated[int, Ge(1), Le(100_000)]
@@ -300,10 +301,12 @@ class Study(_Model):
     accuracy: Accuracies = Field(default=[1e-7], description="Relative accuracy prescribed to QP solvers: an axis.")
     formulation: Annotated[list[FormulationEntry], MinLen(1)] = Field(
         default_factory=lambda: [FormulationEntry(name=default_formulation())],
-        description="Formulations; `mixed` is the program of V_N and the cone. None has axes that it does not use.",
+        description="Formulations; by default one that serves the problems' K, `mixed` for contact.",
     )
     solvers: Solvers = Field(default=[], description="QP solvers; `available` for all installed. By default `daqp`.")
-    dual: Annotated[list[Entry], MinLen(1)] = Field(default=[], description="Dual strategies. Required by `mixed`.")
+    dual: Annotated[list[Entry], MinLen(1)] = Field(
+        default=[], description="Dual strategies; by default one that serves K."
+    )
     primal: Annotated[list[Entry], MinLen(1)] = Field(default=[], description="Primal strategies. Required by `mixed`.")
     assembly: Annotated[list[Literal["full", "reduced"]], MinLen(1)] = Field(
         default=["full"], description="Assembly of queries."
@@ -355,6 +358,8 @@ class Study(_Model):
             given = {"factorisation": study.factorisation}
             study.problem[:] = (one.model_copy(update={"options": given | one.options}) for one in study.problem)
         # After the types: messages about names need valid entries.
+        _check_options(study)
+        _choose_defaults(study)
         _check_names(study)
         return study
 
@@ -404,15 +409,28 @@ def _completed(given: Any) -> Any:
     if not lacking:
         return given
     content = tomllib.loads(Path(usual.load()).read_text(encoding="utf-8"))
-    return {key: content[key] for key in lacking} | given
+    return {key: content[key] for key in lacking if key in content} | given
+
+
+def _choose_defaults(study: Study) -> None:
+    """Fill in a formulation and a dual strategy that serve the dual sets of the problems, where a study names none."""
+    unnamed = "formulation" not in study.model_fields_set
+    if not unnamed and study.dual:
+        return
+    blocks = frozenset[BlockKind]().union(*(blocks_of(one.plugin(PluginKind.PROBLEM)) for one in study.problem))
+    if unnamed:
+        study.formulation[:] = [FormulationEntry(name=default_of(PluginKind.FORMULATION, blocks))]
+    name = default_of(PluginKind.DUAL, blocks)
+    if name and not study.dual and any("dual" in one.uses for one in study.formulation):
+        study.dual[:] = [Entry(name=name)]
 
 
 def _sampling(entry: SamplingEntry) -> Plugin | None:
     return None if entry.name == OWN else entry.plugin(PluginKind.SAMPLING)
 
 
-def _check_names(study: Study) -> None:
-    """Check names and options of plugins, and that exactly the strategies that take a tolerance have one."""
+def _check_options(study: Study) -> None:
+    """Check names and options of plugins."""
     axes: Sequence[tuple[PluginKind, Sequence[Entry]]] = [
         (PluginKind.PROBLEM, study.problem), (PluginKind.DUAL, study.dual), (PluginKind.PRIMAL, study.primal),
         (PluginKind.FORMULATION, study.formulation),
@@ -421,6 +439,10 @@ def _check_names(study: Study) -> None:
         for entry in axis:
             entry.registered(kind).check_options(entry.options)
         _check_given(kind, axis)
+
+
+def _check_names(study: Study) -> None:
+    """Check that axes are not empty, names of solvers, and that exactly strategies that take a tolerance have one."""
     _check_axes(study)
     for problem in study.problem:
         _check_sets(study, problem)

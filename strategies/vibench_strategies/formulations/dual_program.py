@@ -38,6 +38,8 @@ class DualProgram(Formulation):
 
     uses: ClassVar[tuple[str, ...]] = ("pod", "dual", "primal", "solvers", "accuracy", "assembly")
     blocks = (BlockKind.INTERVAL,)
+    is_default = True
+    has_certificate = True
 
     def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:  # noqa: ARG002
         """The reduced model with the rows of its multipliers."""
@@ -53,6 +55,7 @@ class DualProgramModel(PhasesModel):
         self._rows, self._bounds = reduced_rows(offline.cone, self._K)
         self._is_signed = not offline.cone.free.any()
         self.dimension, self.generators = offline.cone.size, len(self._bounds)
+        self.reduced = offline.assembled
 
     def _dual(self, mu: Array) -> tuple[Any, Array, Array]:
         """The reduced problem, L⁻¹[f, Bᵀ] (N'×(1+R)) and the Cholesky factor L."""
@@ -74,12 +77,32 @@ class DualProgramModel(PhasesModel):
         q = Y.T @ whitened[:, 0] - reduced.program.g[: self.dimension]
         return solved(settings, VariationalInequality(S, q, self._rows, self._bounds))
 
-    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
-        """U = Z A⁻¹(f − Bᵀα), and the point of K nearest to χα, which the accuracy of the solver leaves outside."""
+    def coordinates(self, mu: Array, answer: FormulationAnswer) -> tuple[Any, Array, Array]:
+        """The reduced problem, x = A⁻¹(f − Bᵀα), and α on the generators of `reduced`: free ones have both signs.
+
+        α is smaller than that of the answer where the accuracy of the solver leaves χα outside of a bounded K.
+        """
         assert answer.x is not None
+        alpha = np.maximum(answer.x, 0.0) if self._is_signed else answer.x
+        gauge = self._K.gauge(self._chi @ alpha)
+        # Sums over generators of both signs have a round-off of their own.
+        alpha = alpha / (gauge * (1.0 + 1e-12)) if 1.0 - 1e-12 < gauge < np.inf else alpha
         reduced, whitened, L = self._dual(mu)
-        x = solve_triangular(L, whitened[:, 0] - whitened[:, 1:] @ answer.x, lower=True, trans="T")
-        return reduced.reconstruct(x[:, None])[:, 0], self._K.project(self._chi @ answer.x)
+        x = solve_triangular(L, whitened[:, 0] - whitened[:, 1:] @ alpha, lower=True, trans="T")
+        return (
+            reduced,
+            x,
+            alpha if self._is_signed else np.concatenate([np.maximum(alpha, 0.0), np.maximum(-alpha, 0.0)]),
+        )
+
+    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
+        """U = Z x and the point of K nearest to χα, which is χα but for rays."""
+        reduced, x, alpha = self.coordinates(mu, answer)
+        return reduced.reconstruct(x[:, None])[:, 0], self._K.project(self.reduced.generators @ alpha)
+
+    def certificate(self, offline: OfflinePhase) -> Any:
+        """The certificate, of solutions of the dual program at training parameters."""
+        return offline.certificate_of(self.reduced, self)
 
 
 def reduced_rows(cone: Cone, K: DualSet) -> tuple[Array, Array]:

@@ -5,6 +5,8 @@ from functools import cache, partial
 
 import numpy as np
 import pytest
+import qpsolvers
+import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.tri import LinearTriInterpolator, Triangulation
@@ -14,7 +16,7 @@ from skfem import Basis, ElementTriP1, Functional, MeshTri
 from skfem.helpers import dot, grad
 from skfem.models.poisson import laplace, unit_load
 
-from vibench import HighFidelitySolver, Problem, checked_assembly
+from vibench import HighFidelitySolver, Problem, VariationalInequality, checked_assembly, solve_high_fidelity
 from vibench.highfidelity import active_set
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
@@ -75,6 +77,53 @@ def test_constraints_are_integrals_on_the_mapped_mesh() -> None:
 
     bound = Functional(lambda w: -psi(w) * w["eta"]).assemble(inside, eta=inside.interpolate(eta))
     assert np.isclose(eta[OBSTACLE().disc_nodes] @ vi.g, bound, rtol=1e-10)
+
+
+def test_a_membrane_between_two_obstacles_is_that_of_an_independent_solver() -> None:
+    problem, k = Obstacle(200, ceiling=0.01), len(SMALL().disc_nodes)
+    found, vi = HighFidelitySolver(problem).solve(OFF), checked_assembly(problem, OFF)
+    # The gap between both bounds, times the integrals of the multiplier functions.
+    integrals = np.asarray(vi.B[k:].sum(axis=1)).ravel()
+    assert np.allclose(vi.g[:k] + vi.g[k:], 0.01 * integrals, rtol=1e-12)
+    assert abs(vi.B[:k] + vi.B[k:]).max() == 0.0
+    assert found.lam[:k].any()
+    assert found.lam[k:].any()
+    u = qpsolvers.solve_qp(vi.A.toarray(), -vi.f, vi.B.toarray(), vi.g, solver="daqp")
+    assert np.allclose(found.u, u, atol=1e-8)
+    force, area = (output.function for output in problem.outputs[:2])
+    assert np.isclose(force(OFF, found.u, found.lam), integrals @ (found.lam[:k] - found.lam[k:]), rtol=1e-12)
+    assert np.isclose(area(OFF, found.u, found.lam), integrals @ ((found.lam[:k] > 0.0) | (found.lam[k:] > 0.0)))
+    # A ceiling that is out of reach changes nothing.
+    high, alone = (HighFidelitySolver(Obstacle(200, ceiling=c)).solve(OFF) for c in (1.0, None))
+    assert np.allclose(high.u, alone.u, atol=1e-13)
+    assert not high.lam[k:].any()
+
+
+def test_the_coarser_mesh_knows_both_obstacles(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vibench_problems.obstacle.NESTED", 500)
+    fine, calls = Obstacle(800, ceiling=0.01), HighFidelitySolver(Obstacle(200, ceiling=0.01)).solve(OFF)
+    nested = fine.start(OFF, None)
+    assert nested is not None
+    above = np.arange(len(calls.lam)) >= len(calls.lam) // 2
+    assert np.array_equal(above[nested.nearest], np.arange(fine.W.dim) >= fine.W.dim // 2)
+
+
+@pytest.mark.parametrize(("obstacle", "value"), [("A", 1.88646121), ("B", 7.27215590)])
+def test_energies_of_cutest_between_two_obstacles(obstacle: str, value: float) -> None:
+    """OBSTCLAE and OBSTCLBL (Dembo and Tulowitzki) at 100×100 points; edges beside the boundary count half."""
+    h, k = 1.0 / 99.0, 98
+    slopes = sp.csr_array(sp.diags_array([np.ones(k), -np.ones(k)], offsets=[0, -1], shape=(k + 1, k)))
+    K = sp.csr_array(slopes.T @ sp.diags_array(np.r_[0.5, np.ones(k - 1), 0.5]) @ slopes)
+    unit = sp.eye_array(k)
+    x, y = (values.ravel() for values in np.meshgrid(*[h * np.arange(1, k + 1)] * 2, indexing="ij"))
+    lower, upper = np.sin(3.2 * x) * np.sin(3.3 * y), np.full(k * k, 2000.0)
+    if obstacle == "B":
+        wave = np.sin(9.2 * x) * np.sin(9.3 * y)
+        lower, upper = wave**3, wave**2 + 0.02
+    A, B = sp.csr_array(sp.kron(K, unit) + sp.kron(unit, K)), sp.eye_array(k * k)
+    f, g = np.full(k * k, h * h), np.concatenate([-lower, upper])
+    u = solve_high_fidelity(VariationalInequality(A, f, sp.csr_array(sp.vstack([-B, B])), g)).u
+    assert 0.5 * u @ (A @ u) - f @ u == pytest.approx(value, abs=2e-8)
 
 
 def test_the_norm_is_that_of_equation_44() -> None:

@@ -1,15 +1,20 @@
 """Partial slip against Cattaneo's and Mindlin's closed form, and reduced models in its dual set."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from vibench import (
+    DualStrategy,
     Formulation,
     HighFidelitySolver,
     Reduction,
     Snapshots,
     Stop,
+    Study,
     UnsupportedError,
+    run,
 )
 from vibench.model.error_bounds import corrected_pair
 from vibench.offline.assemblies import assemblies
@@ -116,12 +121,49 @@ def test_what_knows_contact_alone_says_so(coarse: Tresca, snapshots: Snapshots) 
     sizes = Stop(size=3), Stop(size=3)
     with pytest.raises(UnsupportedError, match="CPG knows λ ≥ 0 alone; K has intervals"):
         Reduction(coarse, CPG(), None, *sizes).given(snapshots=snapshots).cone  # noqa: B018
-    mixed = Reduction(coarse, PODDual(), None, *sizes).given(snapshots=snapshots)
+    mixed = Reduction(coarse, PODDual(), None, *sizes, formulation=Mixed()).given(snapshots=snapshots)
     with pytest.raises(UnsupportedError, match="the formulation Mixed knows λ ≥ 0 alone; K has intervals"):
         mixed.model.solve([0.8, 0.5])
     reduced = Reduction(coarse, PODDual(), None, *sizes, assembly="reduced").given(snapshots=snapshots)
-    with pytest.raises(UnsupportedError, match="certificates know λ ≥ 0 alone; K has intervals"):
-        reduced.certificate  # noqa: B018
+    coarse.constant, declared = frozenset({"f"}), coarse.constant  # type: ignore[misc]
+    try:
+        with pytest.raises(UnsupportedError, match="in all rows where A is constant; K has intervals, A is not const"):
+            reduced.certificate  # noqa: B018
+    finally:
+        coarse.constant = declared  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("dual", [HullGreedy(), PODDual()])
+def test_bounds_at_online_cost_hold_and_are_sharp(dual: DualStrategy, coarse: Tresca, snapshots: Snapshots) -> None:
+    phase = Reduction(coarse, dual, OnlineSupremizers(), Stop(size=5), Stop(size=6), assembly="reduced", bounds=True)
+    model, solver, found = phase.given(snapshots=snapshots).model, HighFidelitySolver(coarse), []
+    for mu in coarse.validation_set(12, 3):
+        exact, answer, energy = solver.solve(mu), model.solve(mu), assemblies(coarse).energy_at(mu)
+        assert answer.bound is not None
+        assert answer.bound.guarantee == "certified"
+        force = energy.dual_norm(assemblies(coarse).at(mu).B.T @ (exact.lam - answer.lam))
+        errors = energy.norm(exact.u - answer.u), force
+        found.append((answer.bound.u_energy / errors[0], answer.bound.lambda_natural / errors[1]))
+        outputs, bounds = answer.outputs, answer.output_bounds
+        of_exact = coarse.outputs[0].values(mu[None], exact.u[:, None], exact.lam[:, None])[0]
+        assert abs(of_exact - outputs["tangential force"]) <= bounds["tangential force"]
+    assert np.min(found) >= 1.0
+    assert np.median(found) < 2.0
+
+
+def test_a_study_with_bounds_records_and_times_them(tmp_path: Path) -> None:
+    problem = {"name": "tresca", "options": {"resolution": 4, "growth": 2.0}}
+    study = Study(
+        name="bounded", problem=[problem], dual=["pod-dual", "mcpg"], primal=["online-supremizers"], validation=4,
+        tolerances=[{"N": [3], "R": [3]}], assembly=["reduced"], bounds=[True], solvers=["daqp"], timing_rounds=1,
+        timing_rounds_min=1, training=[{"name": "grid", "options": {"counts": [3, 4]}}],
+    )  # fmt: skip
+    found = run(study, tmp_path, jobs=1)
+    cell, other = found.cells.set_index("dual").loc[["pod-dual", "mcpg"]].to_dict("records")
+    assert (cell["status"], cell["certificate"], cell["bound_online_violations"]) == ("ok", "certified", 0)
+    assert cell["online_certify_s"] > 0.0
+    assert (found.queries["effectivity_online_u_energy"].dropna() >= 1.0).all()
+    assert (other["status"], "knows λ ≥ 0 alone" in other["reason"]) == ("unavailable", True)
 
 
 def test_the_friction_coefficient_may_be_a_parameter() -> None:

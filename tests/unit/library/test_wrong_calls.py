@@ -49,6 +49,7 @@ NOT_CALLED = {
     "Contact", "ContactLoads", "ExportedModel", "FormulationAnswer", "HighFidelitySolution",
     "HighFidelitySolver.condensed", "HighFidelitySolver.remember", "HighFidelitySolver.solve_assembled",
     "HighFidelitySolver.solve_next", "HighFidelitySolver.verify", "MeshFields", "Model", "Model.answered",
+    "Model.bound_of",
     "Model.pair", "Model.settings", "Model.solving", "Model.status_of", "OfflinePhase", "Picture", "ProgramModel",
     "QPSolution", "QPSolver", "QuerySettings", "Solution", "Step", "Stop.reached", "VariationalInequality",
     "is_absent",

@@ -264,6 +264,30 @@ ONE = np.arange(SIZE * 3).reshape(SIZE, 3) == 10
 changed("both signs", "solutions.lam has both signs", DUAL_HALF, lam=lambda c: np.where(ONE, -c.lam, c.lam))
 changed("negative snapshots", "solutions.lam is negative: λ has the other sign", DUAL_HALF, lam=lambda c: -c.lam)
 
+ROWS = {"kind": "interval", "rows": "more.npz:rows", "radius": 1.0}
+simple("disc", "K.0.kind: Input should be 'interval'", "K", [{"kind": "disc", "radius": 1.0}])
+simple("no radius", "K.0.radius: required, but not given", "K", [{"kind": "interval"}])
+for radius in (0.0, -1.0):
+    simple(
+        f"radius {radius}", "K.0: a radius is not positive and finite", "K", [{"kind": "interval", "radius": radius}]
+    )
+simple("radius not a number", "K.0.radius", "K", [{"kind": "interval", "radius": float("nan")}])
+simple("radius elsewhere", "pack': K.0.rows: the file 'more.npz' does not exist", "K", [ROWS])
+changed("as many radii as rows", "K.0.radius: 3; expected 2", {"K": [ROWS | {"radius": "more.npz:c"}]},
+        {"rows": lambda c: np.array([0, 4]), "c": lambda c: np.ones(3)})  # fmt: skip
+changed("infinite radius", "K.0.radius: 1 of its entries are not finite", {"K": [ROWS | {"radius": "more.npz:c"}]},
+        {"rows": lambda c: np.array([0, 4]), "c": lambda c: np.array([1.0, np.inf])})  # fmt: skip
+changed("row beyond the others", "K.0.rows", {"K": [ROWS]}, {"rows": lambda c: np.array([0, SIZE])})
+changed("row in two intervals", "K: a row of the dual set is in two blocks", {"K": [ROWS, ROWS]},
+        {"rows": lambda c: np.array([0, 4])})  # fmt: skip
+changed("snapshots outside K", "solutions.lam leaves K by .*: in K are intervals",
+        DUAL_HALF | {"K": [{"kind": "interval", "radius": 1e-3}]})  # fmt: skip
+changed(
+    "solutions outside K",
+    "does not solve the problem: A u . Bᵀλ = f is violated",
+    {"K": [{"kind": "interval", "radius": 1e-3}]},
+)
+
 
 @pytest.fixture
 def broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:

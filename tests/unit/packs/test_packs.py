@@ -31,6 +31,7 @@ from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import create
 from vibench.study.matrix import read_study
 from vibench.testing.problems import continuity
+from vibench_problems.tresca import Tresca
 
 MU = np.array([5.0, 0.2])
 MASS, GAP = "operators.f.affine.0.array", "operators.g.affine.0.theta"
@@ -210,6 +211,32 @@ def test_multipliers_alone_are_enough_for_cones(tmp_path: Path, main: Main) -> N
     assert {path.name for path in Path("here").iterdir()} == {"errors.csv", "errors.png", "errors.svg"}
     whole = str(write_cable(tmp_path / "whole"))
     assert main("pack", whole, "--cones", "--dual", "cpg")[0] == 0
+
+
+def test_friction_with_a_given_bound_is_a_pack(tmp_path: Path, main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the same numbers as the problem it is written of, with reference solutions in K on both of its sides."""
+    few = type("Few", (Tresca,), {"training_set": lambda self: self.parameters.grid(2, 3)})
+    problem, folder = few(4, growth=2.0), tmp_path / "pack"
+    writer.write_pack(problem, folder, name="partial slip", source="", validation=1, seed=0, solutions=True)
+    read = create("problem", "pack", {"path": str(folder)})
+    assert read.K == problem.K
+    mu = read.validation_set(1, 0)[0]
+    one, other = HighFidelitySolver(problem).solve(mu), HighFidelitySolver(read).solve(mu)
+    assert np.array_equal(one.u, other.u)
+    assert np.array_equal(one.lam, other.lam)
+    # Figures take seconds.
+    monkeypatch.setattr("vibench.report.figures.style.save", lambda *_: [])
+    monkeypatch.setattr("vibench.report.figures.spaces.cone_errors", lambda *_: None)
+    code, out, _ = main("pack", str(folder), "--cones", "--dual", "hull-greedy", "--dual", "cpg", "--dual-tol", "0.1")
+    assert code == 0
+    assert "unavailable: cpg: the dual strategy CPG knows λ ≥ 0 alone; K has intervals" in out
+    assert "hull-greedy" in out
+    assert "K: 11 of the multipliers in intervals" in main("pack", str(folder))[1]
+    # The sign of friction is what its multipliers show.
+    lam = dict(np.load(folder / "solutions.npz"))
+    np.savez(folder / "solutions.npz", u=lam["u"], lam=-lam["lam"])
+    with pytest.raises(RequestError, match="probably λ has the other sign"):
+        read_model_pack(folder)
 
 
 def test_import_says_what_a_pack_can_do(tmp_path: Path, main: Main) -> None:

@@ -75,7 +75,7 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
     "correction unknown": (("correction",), ["all"], ("correction", "'none', 'feasible' or 'auto'", "'all'")),
     "correction empty": (("correction",), [], ("correction", "at least 1")),
     "solver unknown": (("solvers",), ["pipq"], ("QP solver", "'pipq'", "did you mean 'piqp'")),
-    "dual missing": (("dual",), REMOVE, ("dual", "required")),
+    "primal missing": (("primal",), REMOVE, ("primal", "required")),
     "dual empty": (("dual",), [], ("dual", "at least 1")),
     "dual unknown": (("dual",), ["mcgp"], ("dual strategy", "'mcgp'", "did you mean 'mcpg'")),
     "dual without name": (("dual",), [{"label": "x"}], ("dual.0.name", "required")),
@@ -161,6 +161,25 @@ def test_the_smallest_study_names_its_problem(tmp_path: Path) -> None:
         assert getattr(study, key) == getattr(usual, key)
     path.write_text('problem = ["obstacle"]\ndual = ["cpg"]\n')
     assert "tolerances" in refusal(str(path))
+
+
+def test_what_a_study_does_not_name_serves_the_dual_sets_of_its_problems(tmp_path: Path) -> None:
+    path, coarse = tmp_path / "smallest.toml", '{ name = "tresca", options = { resolution = 4 } }'
+    chosen = {
+        '"obstacle"': ("mixed", "mcpg"), coarse: ("dual-program", "hull-greedy"),
+        f'"obstacle", {coarse}': ("dual-program", "hull-greedy"),
+    }  # fmt: skip
+    for problems, names in chosen.items():
+        path.write_text(f"problem = [{problems}]\n")
+        study = read_study(str(path))
+        assert tuple(one.name for one in (*study.formulation, *study.dual)) == names
+        assert {(cell.formulation.name, cell.dual.name) for cell in expand(study) if cell.dual} == {names}
+    # What is named stays, and the rest is chosen.
+    problem = [{"name": "tresca", "options": {"resolution": 4}}]
+    named = read_study("default", {"problem": problem, "dual": ["pod-dual"]})
+    assert [one.name for one in (*named.formulation, *named.dual)] == ["dual-program", "pod-dual"]
+    named = read_study("default", {"problem": problem, "formulation": ["mixed"]})
+    assert [one.name for one in (*named.formulation, *named.dual)] == ["mixed", "hull-greedy"]
 
 
 def test_what_is_no_file_of_a_study_or_invalid_toml_is_refused(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ from scipy.sparse.csgraph import connected_components
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import UnsupportedError
+from vibench.interfaces.dual_sets import BlockKind
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.validation import checked_assembly
@@ -209,8 +210,10 @@ class CertificateBase:
 
 def unsupported(problem: Problem, members: Mapping[str, AffineMember]) -> str:
     """Reason why reduced models of a problem cannot be certified at online cost; "" if they can."""
-    if problem.K.blocks:
-        return f"certificates know λ ≥ 0 alone; K has {problem.K.names()}"
+    K = problem.K
+    if K.blocks and (K.kinds != {BlockKind.INTERVAL} or K.rays(problem.W.dim).any() or "A" not in problem.constant):
+        known = "certificates know λ ≥ 0, and intervals in all rows where A is constant"
+        return f"{known}; K has {K.names()}, A is {'' if 'A' in problem.constant else 'not '}constant"
     if not problem.has_contact:
         return "the problem does not assemble its constraint on its contact unknowns (`contact_dofs` and `contact`)"
     count = len(contact_unknowns(problem))

@@ -34,10 +34,11 @@ product of coordinates by at most m ρ ω, and ρ is at most (1 + m) times what 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from math import inf, sqrt
+from typing import TypeAlias
 
 import numpy as np
 import scipy.linalg
@@ -45,20 +46,28 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import UnsupportedError
-from vibench.interfaces.dual_sets import RAYS
 from vibench.interfaces.parameters import outside
 from vibench.interfaces.problem import Contact, Problem
 from vibench.linalg import EPS, UNIT_ROUND_OFF
 from vibench.linalg.factorisations import implementation
 from vibench.model.affine import AffineMember
-from vibench.model.bound_terms import BoundNote, BoundTerms, CorrectionMode
+from vibench.model.bound_terms import BoundNote, BoundTerms, CorrectionMode, outside_note
 from vibench.model.certificates.base import CertificateBase, Guarantee, contact_unknowns, is_exact
-from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction, unknowns_near
+from vibench.model.certificates.contact_correction import (
+    ContactCompliance,
+    ContactCorrection,
+    bounded_correction,
+    find_contact_correction,
+    unknowns_near,
+)
 from vibench.model.certificates.prepared_correction import PreparedCorrections, prepare_corrections
 from vibench.model.certificates.residual import ColumnBlock, ResidualBasis, residual_basis, residual_coefficients
 from vibench.model.galerkin import ReducedProblem, contact_at
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.qp.solve import solve_qp
+
+Solve: TypeAlias = Callable[[Array], tuple[ReducedProblem, Array, Array] | None]
+"""From mu (d,) to a reduced problem with its x and α, or `None` where there is no solution."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +201,7 @@ class OnlineCertificate:
         energy = (size + self._energy_error(query)) * query.lower / (query.lower - query.error)
         values, uncertain = self._on_contact(query)
         uncertain = uncertain + EPS * (len(values) + len(lam) + 4.0) * np.abs(values)
-        force = float(lam @ (query.contact.B @ values)) - float(lam @ (abs(query.contact.B) @ uncertain))
+        force = float(lam @ (query.contact.B @ values)) - float(np.abs(lam) @ (abs(query.contact.B) @ uncertain))
         return force / sqrt(energy) - natural
 
     def _energy_error(self, query: _Query) -> float:
@@ -203,8 +212,8 @@ class OnlineCertificate:
 
     def _bound(self, query: _Query, alpha: Array) -> OnlineBound:
         base, lam, lower, upper = self.base, query.lam, query.lower, query.upper
-        if not RAYS.contains(lam):
-            return OnlineBound.none(BoundNote.NOT_IN_CONE)
+        if not (K := query.problem.K).contains(lam):
+            return OnlineBound.none(outside_note(K))
         if not base.is_exact and outside(query.problem.parameters, query.mu).any():
             return OnlineBound.none(BoundNote.OUTSIDE)
         if not lower > query.error:
@@ -216,7 +225,7 @@ class OnlineCertificate:
         if quick is not None:
             (along, norm, kappa, eta), note = quick, ""
         else:
-            best = find_contact_correction(self.compliance, query.contact, *self._on_contact(query), lam, upper)
+            best = self._best_correction(query, upper)
             if best is None:
                 return OnlineBound.none(BoundNote.NO_CORRECTION)
             # coordinates of X w in the basis of residuals
@@ -235,7 +244,7 @@ class OnlineCertificate:
             # in the seconds of a query
             rows, unit = sp.csr_array(contact.B), 2.0 * EPS * (len(lam) + len(alpha))
             sizes = np.abs(rows.data) * self.compliance.root.take(rows.indices)
-            lacking += unit * float(sizes @ np.repeat(lam, np.diff(rows.indptr)))
+            lacking += unit * float(sizes @ np.repeat(np.abs(lam), np.diff(rows.indptr)))
         rho = (sqrt(float(coordinates @ coordinates) + beside**2) + missing) * (1.0 + self.margin) + lacking
         kappa *= 1.0 + self.margin
         # an upper bound of rᵀw: what r has besides its coordinates may act along w, and w' is within η of w
@@ -280,6 +289,12 @@ class OnlineCertificate:
         delta = sqrt(left**2 + 2.0 * found.gap) + eta * sqrt(upper)
         return sqrt(upper) * distance + delta, middle * found.norm / sqrt(lower) + delta
 
+    def _best_correction(self, query: _Query, gamma: float) -> ContactCorrection | None:
+        """The best correction for γ, found at the parameter; `None` if none was found."""
+        given = self.compliance, query.contact, *self._on_contact(query), query.lam, gamma
+        K = query.problem.K
+        return bounded_correction(*given, K) if K.blocks else find_contact_correction(*given)
+
     def _on_contact(self, query: _Query) -> tuple[Array, Array]:
         """The solution u_N (k,) on the contact unknowns, and a bound of its round-off."""
         return self.contact_basis @ query.y, float(np.linalg.norm(query.y)) * self.unit_round_off
@@ -302,7 +317,7 @@ class OnlineCertificate:
             B, g, g_size = self._constraint(query)
             pair = self.prepared.multiplier(float(B), g, g_size, query.y, lam, middle)
         if pair is None:
-            best = find_contact_correction(self.compliance, contact, *self._on_contact(query), lam, middle)
+            best = self._best_correction(query, middle)
             if best is None or best.nu is None:
                 return None
             pair = best.nu, best.norm, best.gap, best.eta + best.away
@@ -328,11 +343,13 @@ class OnlineCertificate:
 
 
 def prepare(
-    model: HyperReducedModel, members: Mapping[str, AffineMember], base: CertificateBase, training: Array
-) -> OnlineCertificate:
+    model: HyperReducedModel, members: Mapping[str, AffineMember], base: CertificateBase, training: Array,
+    solve: Solve | None = None,
+) -> OnlineCertificate:  # fmt: skip
     """Prepare the certificate of a reduced model, from the members it was made of and its `certificate_base`.
 
-    Only sharpness depends on `training` (P×d), parameters that show which terms of residuals contribute.
+    Only sharpness depends on `training` (P×d), parameters that show which terms of residuals contribute, and on who
+    solves there: by default a QP solver the programs of the model.
     """
     problem, Phi, chi, B = model.problem, model.basis, model.generators, members["B"]
     X, dofs, scaled = base.X.matrix, contact_unknowns(problem), base.bound_terms is not None
@@ -363,10 +380,11 @@ def prepare(
     near = np.any([unknowns_near(contact_at(problem, mu).B, chi) for mu in training], axis=0)
     compliance = ContactCompliance(base.compliance, np.flatnonzero(near), base.compliance_error)
     contact_basis = np.ascontiguousarray(Phi[dofs])
-    z, typical, held = _sampled(model, base, compliance, forces, training)
+    z, typical, held = _sampled(model, base, compliance, forces, training, solve or partial(_solved, model))
     residual, U = residual_basis(blocks, z, typical, len(dofs))
     directions = scipy.linalg.solve_triangular(trailing, U)
-    corrections = prepare_corrections(base.constraint, scaled, compliance, held, contact_basis, directions)
+    prepared = (base.constraint, scaled, compliance, held, contact_basis, directions)
+    corrections = None if problem.K.blocks else prepare_corrections(*prepared)
     trailing, scale = np.abs(trailing), np.sqrt(squares[dofs])
     # of the dense factor γ_{k+1}|F|ᵀ|F|, whose largest row sum in units of S is at least its norm
     dense = (len(dofs) + 2.0) * UNIT_ROUND_OFF * float(np.max(trailing.T @ (trailing @ (1.0 / scale)) / scale))
@@ -391,8 +409,9 @@ def _energy_round_off(terms: Sequence[SparseMatrix], Phi: Array) -> Array:
 
 
 def _sampled(
-    model: HyperReducedModel, base: CertificateBase, compliance: ContactCompliance, forces: Array | None, mus: Array
-) -> tuple[Array, float, Mask]:
+    model: HyperReducedModel, base: CertificateBase, compliance: ContactCompliance, forces: Array | None, mus: Array,
+    solve: Solve,
+) -> tuple[Array, float, Mask]:  # fmt: skip
     """Samples of reduced solutions at training parameters, with the `forces` of `residual_coefficients`.
 
     They are coefficients (Z×S) of residuals, the median norm of corrections, and the rows (m,) that some of these hold.
@@ -401,23 +420,31 @@ def _sampled(
     rows = np.ascontiguousarray(model.basis[contact_unknowns(problem)])
     # up to 200 samples, and a correction of every eighth: only medians and maxima of them are used
     for number, mu in enumerate(mus[:: -(-len(mus) // 200)]):
-        reduced = model.assemble(mu)
-        answer = solve_qp(reduced.program, "daqp", 1e-8, factor=reduced.factor)
-        if answer.x is None or answer.alpha is None or not np.all(np.isfinite(answer.x)):
+        if (solved := solve(mu)) is None:
             continue
-        evaluated, alpha = reduced.evaluated, np.maximum(answer.alpha, 0.0)
-        lam, y = model.generators @ alpha, evaluated.in_space(answer.x)
+        reduced, x, alpha = solved
+        evaluated = reduced.evaluated
+        lam, y = model.generators @ alpha, evaluated.in_space(x)
         contact, theta = evaluated.contact or contact_at(problem, mu), base.coefficients(evaluated.samples)
         residuals.append(residual_coefficients(theta, y, forces, contact, alpha, lam))
         # rows that are violated, or in which the best w may hold B w = s for γ = 1
         excess, reach = contact.B @ (rows @ y) - contact.g, abs(contact.B) @ compliance.root
         held |= (excess > 0.0) | (lam * reach**2 > np.abs(excess))
-        if number % 8 == 0:
+        if number % 8 == 0 and not problem.K.blocks:
             correction = find_contact_correction(compliance, contact, rows @ y, np.zeros(len(rows)), lam, 1.0)
             norms += [] if correction is None else [correction.norm]
     if not residuals:
         raise UnsupportedError("no reduced program at a training parameter has a solution")
     return np.column_stack(residuals), float(np.median(norms)), held
+
+
+def _solved(model: HyperReducedModel, mu: Array) -> tuple[ReducedProblem, Array, Array] | None:
+    """The program of a model at mu (d,) with its solution; `None` if it has none."""
+    reduced = model.assemble(mu)
+    answer = solve_qp(reduced.program, "daqp", 1e-8, factor=reduced.factor)
+    if answer.x is None or answer.alpha is None or not np.all(np.isfinite(answer.x)):
+        return None
+    return reduced, answer.x, np.maximum(answer.alpha, 0.0)
 
 
 def output_error_bound(weights: tuple[float, float], base: CertificateBase, bound: OnlineBound) -> float:

@@ -15,6 +15,8 @@ M-matrix. Then v is found as the minimiser of ½ vᵀM v + ν₀ᵀv over v ≥ 
 Least Squares Problems, 1974, chapter 23), whose objective falls in every step. Round-off decides where ν and v are both
 zero: SciPy's own method, which does not bound it, returns wrong solutions in such cases (1.17.1).
 
+**Intervals.** A bounded K asks nothing of w, and every w has a κ: active sets of three states find the best one.
+
 **Equalities.** The rows of a row and its opposite are dependent. The program is then solved as a least distance problem
 in y, w_E = L y, with C = L Lᵀ and ‖w‖ = |y|. The w' that holds them is within η of w (`vibench.model.bound_terms`).
 """
@@ -31,7 +33,9 @@ import scipy.sparse as sp
 from scipy.linalg.lapack import dposv, dpotrf, dpotrs
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
-from vibench.interfaces.dual_sets import RAYS
+from vibench.highfidelity.active_set import active_set_iterations
+from vibench.highfidelity.kkt_systems import ActiveSetSystem
+from vibench.interfaces.dual_sets import RAYS, DualSet
 from vibench.interfaces.problem import Contact
 from vibench.linalg import EPS
 from vibench.linalg.definite import BlockDiagonal
@@ -171,6 +175,38 @@ def find_contact_correction(
         if program.restrict(*block) and (found := program.best()) is not None:
             return found
     return program.tied()
+
+
+def bounded_correction(
+    compliance: ContactCompliance, contact: Contact, on_contact: Array, uncertain: Array, lam: Array, gamma: float,
+    K: DualSet,
+) -> ContactCorrection:  # fmt: skip
+    """The best w for λ in intervals K (m,), or w = 0 where active sets cycle: every w has a κ.
+
+    ν − λ minimises ½ dᵀS d − sᵀd over λ + d ∈ K, with S = B C Bᵀ/γ; there is no row that w has to satisfy.
+    """
+    program = _Program(compliance, contact, on_contact, uncertain, lam, gamma)
+    B, s, reached = program.B, program.excess, np.asarray(program.B @ compliance.matrix)
+    S = np.asarray(B @ reached.T) / gamma
+
+    def solve_active(active: Indices, fixed: Array | None = None) -> tuple[Array, Array]:
+        difference = -lam if fixed is None else fixed - lam
+        difference[active] = 0.0
+        difference[active] = np.linalg.solve(S[np.ix_(active, active)], (s - S @ difference)[active])
+        return difference @ reached / gamma, lam + difference
+
+    system = ActiveSetSystem(-B, -s, solve_active, np.asarray, np.asarray, K=K)
+    found = active_set_iterations(system, K.free(lam))
+    nu = lam if found is None else K.project(found[1])
+    load = np.asarray(B.T @ (nu - lam)) / gamma
+    values, unit = compliance.matrix @ load, 1.01 * EPS * (len(load) + len(lam) + 8.0)
+    size = float(compliance.root @ np.abs(load))
+    norm = float(np.sqrt((max(0.0, float(load @ values)) + 2.0 * unit * size**2) * (1.0 + compliance.error)))
+    rounded = program.terms * (program.sizes @ np.abs(values)) + program.round_off + program.reach * unit * size
+    slack = B @ values - s
+    kappa, gap = (K.gap(one, slack, rounded) for one in (lam, nu))
+    away = compliance.error * norm + unit * float(program.reach @ (np.abs(nu) + np.abs(lam))) / gamma
+    return ContactCorrection(np.arange(len(load)), load, norm, kappa, nu, gap, 0.0, away)
 
 
 class _Program:

@@ -6,10 +6,17 @@ import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
 from numerics import exact, spd
+from scipy.optimize import lsq_linear
 
+from vibench.interfaces.dual_sets import DualSet
 from vibench.interfaces.problem import Contact, VariationalInequality
 from vibench.model.certificates import contact_correction
-from vibench.model.certificates.contact_correction import ContactCompliance, ContactCorrection, find_contact_correction
+from vibench.model.certificates.contact_correction import (
+    ContactCompliance,
+    ContactCorrection,
+    bounded_correction,
+    find_contact_correction,
+)
 
 K, M = 7, 6
 EVERY = np.arange(K)
@@ -32,6 +39,26 @@ def programs(draw: st.DrawFn) -> Program:
 def corrected(given: Program, near: np.ndarray = EVERY) -> ContactCorrection | None:
     C, contact, u, lam, gamma = given
     return find_contact_correction(ContactCompliance(C, near, 0.0), contact, u, np.zeros(K), lam, gamma)
+
+
+@given(programs(), st.sampled_from([1e-3, 0.3, 10.0]))
+def test_corrections_for_intervals_are_the_best_ones_and_no_w_violates_anything(given: Program, radius: float) -> None:
+    C, contact, u, lam, gamma = given
+    bounded = DualSet.intervals(np.arange(M), radius)
+    lam = bounded.project(lam - 0.5)
+    found = bounded_correction(ContactCompliance(C, EVERY, 0.0), contact, u, np.zeros(K), lam, gamma, bounded)
+    B, s, w = contact.B.toarray(), contact.B @ u - contact.g, C @ found.load
+    assert found.kappa >= bounded.support(s - B @ w) - lam @ (s - B @ w) - 1e-14 * np.abs(s).sum() * radius
+    assert found.norm == pytest.approx(float(np.sqrt(w @ np.linalg.solve(C, w))), rel=1e-6, abs=1e-12)
+    if np.linalg.cond(B @ B.T) > 1e6:  # active sets of dependent rows may cycle: w = 0 is no less a correction
+        return
+    # ½ dᵀS d − sᵀd over the box, as least squares
+    L = np.linalg.cholesky(B @ C @ B.T / gamma)
+    best = lsq_linear(L.T, np.linalg.solve(L, s), (-radius - lam - 1e-14, radius - lam + 1e-14), tol=1e-14).x
+    assert found.nu is not None
+    least, own = (0.5 * np.sum((L.T @ d) ** 2) - s @ d for d in (best, found.nu - lam))
+    assert own <= least + 1e-9 * np.abs(s).sum() * radius
+    assert found.gap <= (1e-9 * np.abs(s).sum() + 1e-13) * (1.0 + radius)
 
 
 def values(C: np.ndarray, found: ContactCorrection) -> np.ndarray:
