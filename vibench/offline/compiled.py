@@ -28,7 +28,7 @@ from vibench.interfaces.validation import training_parameters
 from vibench.model.chebyshev import AffinePolynomial
 from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel
 from vibench.offline import c_source
-from vibench.offline.c_source import contact_text
+from vibench.offline.c_source import ContactCode, contact_text
 from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, declared_model, member_polynomials
 from vibench.qp.exact import exact_solution
 from vibench.qp.verification import QPSolution
@@ -37,7 +37,10 @@ from vibench.text import one_line
 
 @dataclass(frozen=True)
 class CompiledModel:
-    """Data of the C source of a model: polynomials of A, f, B and g, and the accuracy that it verifies."""
+    """Data of the C source of a model: polynomials of A, f, B and g, and the accuracy that it verifies.
+
+    B and g have none where the problem has C code for them, which is that of a reduced model in the same process.
+    """
 
     members: Mapping[str, AffinePolynomial]
     # The box, `lower` and `upper` (d,), and those of `first_sets`.
@@ -54,27 +57,29 @@ class CompiledModel:
             queried = declared_model(reduced)
             if isinstance(queried, HyperReducedModel) and queried.space is not None:
                 raise RequestError("the enrichment changes the basis at every parameter")
-            polynomials = member_polynomials(queried, TOLERANCE, EVALUATIONS, check=_refuse_large)
+            coded = "" if ContactCode.of(queried) is None else "Bg"
+            members = member_polynomials(queried, TOLERANCE, EVALUATIONS, check=_refuse_large, left_out=coded)
         except RequestError as error:
             raise UnsupportedError(f"the model cannot be exported to C: {error}") from None
-        box, members = reduced.problem.parameters, {name: polynomials[name] for name in MEMBERS}
+        box = reduced.problem.parameters
         # Store polynomials and not the source: who loads an artefact runs nothing that is in it.
         arrays = {"lower": box.lower, "upper": box.upper, **first_sets(reduced, members)}
         return cls(members, arrays, accuracy)
 
-    @property
-    def source(self) -> str:
+    def source(self, reduced: AnyReducedModel | None = None) -> str:
         """The C source; its function is called `model_solve`."""
         about: Mapping[str, Any] = {
             "parameters": {"names": (), "units": ()}, "exported_by": "vibench",
             "cell": dict.fromkeys(("problem", "dual", "primal", "cell"), "of this run"), "accuracy": self.accuracy,
             "source": dict.fromkeys(("distribution", "licence"), "as the problem"),
         }  # fmt: skip
-        return c_source.source(self.members, self.arrays, about, "model")[0]
+        code = None if reduced is None else ContactCode.of(reduced)
+        return c_source.source(self.members, self.arrays, about, "model", code=code)[0]
 
-    def program(self) -> CompiledProgram:
+    def program(self, reduced: AnyReducedModel | None = None) -> CompiledProgram:
         """Compile and load the program; raises an `UnsupportedError` if there is no C compiler, or it fails."""
-        return CompiledProgram(self.source, *(self.members[name].terms.shape[1] for name in "fg"))
+        f, g = (self.members[name].terms.shape[1] if name in self.members else 0 for name in "fg")
+        return CompiledProgram(self.source(reduced), f, g if reduced is None else reduced.generators.shape[1])
 
 
 def first_sets(reduced: AnyReducedModel, members: Mapping[str, AffinePolynomial]) -> dict[str, Array]:
