@@ -294,8 +294,8 @@ def _certificate_arrays(
         "round_off": np.array(residual.round_off), "margins": np.array([certificate.margin, corrections.error]),
     }  # fmt: skip
     if unknowns is not None:
-        loads = np.zeros((base.X.dim, len(corrections.rows)))
-        loads[unknowns] = base.constraint[corrections.rows].toarray().T
+        loads = np.zeros((base.X.dim, len(_shifts(certificate))))
+        loads[unknowns] = _shifts(certificate).T
         found["lift"] = base.X.riesz(loads)
     of_A = "A" if _stiffness_coefficients(certificate) is None else "theta_A"
     error = {name: 0.0 if name in exact else _error(polynomial) for name, polynomial in polynomials.items()}
@@ -325,6 +325,8 @@ def _certificate_arrays(
         bodies, (ends, columns, values) = base.inf_sup.entries
         found |= {"forces": certificate.forces, "bodies": bodies.astype(int)}
         found |= {"known_ends": ends, "known_columns": columns, "known_values": values}
+        _, position, block = certificate.compliance.blocks[0]
+        found |= {"near": position, "near_compliance": block.toarray()}
     if (spectral := base.spectral) is not None:
         grid = spectral.grid
         found |= {
@@ -339,6 +341,14 @@ def _certificate_arrays(
             found["ranges"] = np.column_stack([ranges.reference, ranges.lower, ranges.upper])
             found["range_errors"] = np.array([ranges.error, error["theta_A"] * np.linalg.norm(widest)])
     return {f"certificate_{name}": array for name, array in found.items()}
+
+
+def _shifts(certificate: OnlineCertificate) -> Array:
+    """Loads (j×k) on the contact unknowns whose multiples correct a solution."""
+    if certificate.base.bound_terms is None:
+        return np.eye(len(certificate.compliance.matrix))[certificate.compliance.near]
+    assert certificate.prepared is not None  # there is no reason for none
+    return np.asarray(certificate.base.constraint[certificate.prepared.rows].toarray())
 
 
 def _error(polynomial: AffinePolynomial) -> float:
@@ -368,11 +378,11 @@ def _output_arrays(model: Model, basis: Array, rays: Array, certificate: OnlineC
     of_u, of_lam = (np.array(rows) for rows in zip(*pairs, strict=True))
     found = {"outputs_x": of_u @ basis, "outputs_alpha": of_lam @ rays}
     if certificate is not None and certificate.prepared is not None:
-        B, X = certificate.base.constraint[certificate.prepared.rows], certificate.base.X
+        X = certificate.base.X
         lifted = np.array([X.riesz(row)[contact_unknowns(problem)] for row in of_u])
         found |= {
             "certificate_outputs_lam": of_lam,
-            "certificate_outputs_shift": lifted @ B.T,
+            "certificate_outputs_shift": lifted @ _shifts(certificate).T,
             "certificate_outputs_weights": np.array([model.output_weights[output.name] for output in outputs]),
         }
     return found

@@ -157,9 +157,10 @@ def source(
         parts.append("outputs")
     if thetas:
         values |= _certified({key: own[key] for key in thetas}, arrays) | {"guarantee": about["certificate"]}
-        kind, contacts = "scaled" if code is None else "on_contact", len(arrays["certificate_basis"])
-        values["certified_constraint"] = filled(f"reduced_model_{kind}.c", {"contacts": contacts})
-        values["scaled"] = int(code is None)
+        values["contacts"] = len(arrays["certificate_basis"])
+        kind, pair = ("scaled", "prepared_pair") if code is None else ("on_contact", "best_pair")
+        values["certified_constraint"] = filled(f"reduced_model_{kind}.c", values)
+        values["correction"] = filled(f"reduced_model_{pair}.c", values)
         parts += ["certificate", "certified_outputs"] if parts else ["certificate"]
     for kind, name in (("h", "declarations"), ("c", "code")):
         values[name] = "".join(filled(f"reduced_model_{part}.{kind}", values) for part in parts)
@@ -191,14 +192,18 @@ def _certified(thetas: Mapping[str, AffinePolynomial | ExactMember], arrays: Map
     own.pop("certificate_lift", None)
     rows, (moved, loads) = len(own["certificate_generators"]), own["certificate_responses"].shape
     directions, kept = own["certificate_factor"].shape
+    # Where the best correction is computed at the parameter, its rows are independent.
+    near = len(own.get("certificate_near_compliance", ()))
+    largest = max(loads, chosen := min(rows, near))
     norms = own["certificate_norms"].size
     # Doubles on the stack of the certificate, for its documentation in the header.
-    numbers = loads * (loads + 1) // 2 + 8 * rows + 20 * loads + norms + kept
+    numbers = largest * (largest + 1) // 2 + chosen**2 + 14 * rows + 20 * (largest + near) + norms + kept
     sizes = dict.fromkeys(("theta_B", "theta_g"), 1)
     sizes |= {name: polynomial.terms.shape[1] for name, polynomial in thetas.items()}
     declared = len(arrays.get("certificate_term_errors", ()))
     return sizes | {
-        "rows": rows, "loads": loads, "moved": moved, "directions": directions, "kept": kept, "residual_terms": norms,
+        "rows": rows, "loads": loads, "near": near, "chosen": chosen, "largest": largest, "shifts": near or loads,
+        "moved": moved, "directions": directions, "kept": kept, "residual_terms": norms,
         "spectral": int("certificate_anchors" in arrays), "stack": round(8e-3 * numbers) + 1,
         "ranges": len(arrays.get("certificate_ranges", ())), "leading": len(own["certificate_turn"]),
         "declared": declared, "stiffness_terms": sizes["theta_A"] - declared,
