@@ -11,7 +11,7 @@ import os
 import shlex
 import shutil
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,18 +68,22 @@ class CompiledModel:
 
     def source(self, reduced: AnyReducedModel | None = None) -> str:
         """The C source; its function is called `model_solve`."""
-        about: Mapping[str, Any] = {
-            "parameters": {"names": (), "units": ()}, "exported_by": "vibench",
-            "cell": dict.fromkeys(("problem", "dual", "primal", "cell"), "of this run"), "accuracy": self.accuracy,
-            "source": dict.fromkeys(("distribution", "licence"), "as the problem"),
-        }  # fmt: skip
         code = None if reduced is None else ContactCode.of(reduced)
-        return c_source.source(self.members, self.arrays, about, "model", code=code)[0]
+        return c_source.source(self.members, self.arrays, about_model(self.accuracy), "model", code=code)[0]
 
     def program(self, reduced: AnyReducedModel | None = None) -> CompiledProgram:
         """Compile and load the program; raises an `UnsupportedError` if there is no C compiler, or it fails."""
         f, g = (self.members[name].terms.shape[1] if name in self.members else 0 for name in "fg")
         return CompiledProgram(self.source(reduced), f, g if reduced is None else reduced.generators.shape[1])
+
+
+def about_model(accuracy: float, outputs: Sequence[Mapping[str, str]] = ()) -> dict[str, Any]:
+    """The texts of a source that stays in this process."""
+    return {
+        "parameters": {"names": (), "units": ()}, "exported_by": "vibench", "outputs": {"linear": list(outputs)},
+        "cell": dict.fromkeys(("problem", "dual", "primal", "cell"), "of this run"), "accuracy": accuracy,
+        "source": dict.fromkeys(("distribution", "licence"), "as the problem"),
+    }  # fmt: skip
 
 
 def first_sets(reduced: AnyReducedModel, members: Mapping[str, AffinePolynomial]) -> dict[str, Array]:
@@ -124,11 +128,8 @@ class CompiledProgram:
     """A program of `unknowns` and `constraints`, compiled and loaded; an `UnsupportedError` if the compiler fails."""
 
     def __init__(self, source: str, unknowns: int, constraints: int) -> None:
-        # A library that is loaded needs its file no longer.
-        with foreign("the C compiler, or what it makes, cannot be used"), scratch() as folder:
-            self._solve = ctypes.CDLL(str(compiled(source, folder))).model_solve_counting
+        self._solve = loaded(source, "model_solve_counting", 5)
         self._sizes = unknowns, constraints
-        self._solve.argtypes, self._solve.restype = [ctypes.c_void_p] * 5, ctypes.c_int
 
     def __call__(self, mu: Array) -> QPSolution:
         """The solution at mu (d,), verified by the program alone."""
@@ -149,9 +150,7 @@ def compiled_contact(source: ContactSource, shape: tuple[int, int]) -> Callable[
     """`Problem.contact` by its C source, with B of this shape; an `UnsupportedError` if the compiler fails."""
     wrapped = "int called(const double *mu, int *ends, int *columns, double *values, double *g)"
     text = f"#include <math.h>\n{contact_text(source)}{wrapped} {{ return contact(mu, ends, columns, values, g); }}"
-    with foreign("the C compiler, or what it makes,"), scratch() as folder:
-        call = ctypes.CDLL(str(compiled(text, folder))).called
-    call.argtypes = [ctypes.c_void_p] * 5
+    call = loaded(text, "called", 5)
 
     def contact(mu: Array) -> Contact | None:
         ends, columns = np.zeros(shape[0] + 1, np.intc), np.zeros(source.entries, np.intc)
@@ -163,6 +162,15 @@ def compiled_contact(source: ContactSource, shape: tuple[int, int]) -> Callable[
         return Contact(sp.csr_array((values[: ends[-1]], columns[: ends[-1]], ends), shape), g)
 
     return contact
+
+
+def loaded(source: str, name: str, pointers: int) -> Callable[..., int]:
+    """A function of so many pointers, of a source that is compiled and loaded into this process."""
+    # A library that is loaded needs its file no longer.
+    with foreign("the C compiler, or what it makes, cannot be used"), scratch() as folder:
+        found = ctypes.CDLL(str(compiled(source, folder)))[name]
+    found.argtypes = [ctypes.c_void_p] * pointers
+    return found
 
 
 def compiler() -> list[str]:

@@ -468,7 +468,7 @@ def test_loaded_ties_hide_no_contact_from_c_and_scripts(share: float, tmp_path: 
     members = {"A": linear(A[np.triu_indices(5)], {}, 1), "f": linear(f, {}, 1), "B": linear(B, {}, 1)}
     members["g"] = linear(g, {}, 1)
     text = c_source.source(members, {"lower": np.zeros(1), "upper": np.ones(1)}, about(["t"]), "case")[0]
-    judged = "        status = verify(&p"
+    judged = "        status = verify(p"
     spoilt = text.replace(judged, f"    alpha[0] *= {share};\n    alpha[1] *= {share};\n{judged}")
     (tmp_path / "case.c").write_text(spoilt, encoding="utf-8")
     code, x, alpha, found = compiled(tmp_path / "case.c", 5, 5)(np.zeros(1))
