@@ -64,7 +64,6 @@ from .interfaces.strategies import no_free as no_free
 from .interfaces.validation import check_cone as check_cone
 from .interfaces.validation import check_enrichment as check_enrichment
 from .interfaces.validation import checked_assembly as checked_assembly
-from .library.export import ExportedModel as ExportedModel
 from .library.export import export_model as export_model
 from .library.runs import Run as Run
 from .library.runs import open_run as open_run
@@ -74,6 +73,7 @@ from .linalg.inner_product import InnerProduct as InnerProduct
 from .model.galerkin import projected_members as projected_members
 from .offline.compiled import CompiledModel as CompiledModel
 from .offline.compiled import CompiledProgram as CompiledProgram
+from .offline.exported import ExportedModel as ExportedModel
 from .offline.models import Model as Model
 from .offline.models import ProgramModel as ProgramModel
 from .offline.reduction import Reduction as Reduction

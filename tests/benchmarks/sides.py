@@ -134,7 +134,7 @@ class Ours(Side):
         self.per_parameter = replace(self.fixed, primal=OnlineSupremizers(), tolerance=None).given(**made)
         assert self.per_parameter.assembled
         try:
-            self.compiled = CompiledModel.of(self.fixed.assembled, 1e-10).program()
+            self.compiled = CompiledModel.of(self.fixed.assembled, 1e-10).program(self.fixed.assembled)
         except UnsupportedError as error:
             self.not_compiled = str(error)
 

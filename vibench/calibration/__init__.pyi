@@ -4,6 +4,7 @@ from .data import Data as Data
 from .data import Prior as Prior
 from .data import read_data as read_data
 from .decisions import BoundedSensors as BoundedSensors
+from .decisions import CompiledSensors as CompiledSensors
 from .decisions import Decisions as Decisions
 from .decisions import Interval as Interval
 from .decisions import Prediction as Prediction

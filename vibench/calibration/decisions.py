@@ -42,7 +42,7 @@ from cachetools import LRUCache
 
 from vibench.arrays import Array, SparseMatrix, is_sound
 from vibench.calibration.data import Data, outputs_of
-from vibench.errors import NumericalError, RequestError
+from vibench.errors import NumericalError, RequestError, UnsupportedError
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.formulations import FormulationAnswer
 from vibench.interfaces.parameters import outside
@@ -53,6 +53,9 @@ from vibench.model.certificates.base import Guarantee, output_coefficients, outp
 from vibench.model.certificates.bounds import OnlineBound, output_error_bound
 from vibench.model.galerkin import Evaluated, contact_at
 from vibench.model.hyperreduced import HyperReducedModel
+from vibench.offline import c_source
+from vibench.offline.compiled import loaded
+from vibench.offline.exported import exported
 from vibench.offline.models import Model
 from vibench.qp.verification import QPSolution
 from vibench.signatures import Rule, Seed, constructed
@@ -120,7 +123,7 @@ class BoundedSensors:
         share = share_of_diagonal(problem.W)
         if not (self.base.inf_sup.value > 0.0 and share.proved and share.value > 0.0):
             raise RequestError(f"λ has no bound, which the accuracy of solutions needs: {self.base.inf_sup.note}")
-        self._mass = share.value * problem.W.matrix.diagonal()
+        self.names, self.mass = names, share.value * problem.W.matrix.diagonal()
         self._root = np.sqrt((1.0 + self.base.compliance_error) * np.diag(self.base.compliance))
         # Where B(µ) is θ(µ) B₀ it need not be assembled.
         self._is_scaled, self._reach = self.base.bound_terms is not None, self._lengths(self.base.constraint)
@@ -171,7 +174,7 @@ class BoundedSensors:
         elif evaluated.contact is not None:
             d, entries = self._lengths(evaluated.contact.B)
         d = d * (theta / sqrt(bound.coercivity))
-        force = float(d @ lam) + sqrt(float(d @ (d / self._mass))) * bound.lam
+        force = float(d @ lam) + sqrt(float(d @ (d / self.mass))) * bound.lam
         # A tenth more for the round-off in ‖u_N‖.
         size = 1.1 * (bound.u_energy / bound.relative + 2.0 * bound.u_energy)
         return 2.0 * sqrt(max(Sensors.accuracy, 3.0 * EPS * (entries + 2.0))) * max(force, size)
@@ -182,6 +185,48 @@ class BoundedSensors:
         counts, sizes = np.diff(B.indptr), np.abs(B.data) * self._root.take(B.indices)
         sums = np.bincount(np.repeat(np.arange(len(counts)), counts), sizes, len(counts))
         return np.asarray(sums, float), int(counts.max())
+
+
+class CompiledSensors:
+    """The outputs of `BoundedSensors` by a C program, compiled and loaded into this process: a query is one call.
+
+    Pairs whose violation dominates the bounds are corrected. Raises an `UnsupportedError` without a C compiler, and a
+    `RequestError` if the model has no program with bounds.
+    """
+
+    def __init__(self, sensors: BoundedSensors) -> None:
+        model, base = sensors.model, sensors.base
+        found = exported(model, bases=False, c=True)
+        if why := found.about["no_bounds"]:
+            raise RequestError(f"the C program of the model has no bounds: {why}")
+        # No row has more entries than there are contact unknowns.
+        accuracy = max(Sensors.accuracy, 3.0 * EPS * (len(base.compliance) + 2.0))
+        text, _ = found.source("model", {
+            "sensor_mass": c_source.numbers(sensors.mass), "sensor_inf_sup": base.inf_sup.value,
+            "sensor_accuracy": accuracy, "sensor_mode": [*CorrectionMode].index(CorrectionMode.AUTO),
+        })  # fmt: skip
+        self._sensed, self._guarantee = loaded(text, "model_sensed", 4), Guarantee(found.about["certificate"])
+        names = [output["name"] for output in found.about["outputs"]["linear"]]
+        self._chosen = [names.index(name) for name in sensors.names]
+        self._found = np.zeros((2, len(names)))
+        # The active set of the last solution: steps are small.
+        self._active = np.zeros(model.reduced.generators.shape[1] + 1, np.uint8)
+
+    def __call__(self, mu: Array) -> Prediction:
+        """The outputs at mu (d,), with bounds that allow for the accuracy of the high-fidelity solution."""
+        at = np.ascontiguousarray(mu, float)
+        code = self._sensed(*(array.ctypes.data for array in (at, self._active, *self._found)))
+        outputs, bounds = self._found[:, self._chosen]
+        return Prediction.without_bounds(outputs) if code else Prediction(outputs, bounds, self._guarantee)
+
+
+def quickest_sensors(model: Model, names: tuple[str, ...]) -> tuple[Predict, str]:
+    """Outputs with bounds by the C program of a model where it has one, or in Python; which, and why."""
+    sensors = BoundedSensors(model, names)
+    try:
+        return CompiledSensors(sensors), "C program"
+    except (RequestError, UnsupportedError) as reason:
+        return sensors, f"Python: {reason}"
 
 
 @dataclass(eq=False)

@@ -42,7 +42,7 @@ def calibrate(
     asked. Ctrl-C keeps its answers, and the same command continues with them.
     """
     from vibench.calibration.data import outputs_of, read_data, refuse_unreachable, share
-    from vibench.calibration.decisions import BoundedSensors, Decisions
+    from vibench.calibration.decisions import Decisions, quickest_sensors
     from vibench.calibration.metropolis import Metropolis, arviz
     from vibench.execution.recorded_cell import cell_model, recorded_cell
     from vibench.stages.base import build_problem
@@ -61,15 +61,17 @@ def calibrate(
     with new_console().status(f"model: {chosen}"):
         model, training = timed(lambda: cell_model(chosen) if recorded is None else recorded.model)
     with placed(str(data)):
-        predict, solved = BoundedSensors(model, measured.sensors), model.offline.snapshots
+        solved = model.offline.snapshots
         sensors = outputs_of(target, measured.sensors)
         refuse_unreachable(measured, [one.values(solved.mu, solved.u, solved.lam) for one in sensors])
+        # Compiling is part of the training.
+        (predict, by), compiling = timed(lambda: quickest_sensors(model, measured.sensors))
     decisions = Decisions(target, measured, predict, share(audit), seed)
     chain, folder = Metropolis(decisions, prior, steps // 5, seed), out or Path("calibrations") / data.stem
     about = {"data": data.read_text(encoding="utf-8"), "cell": chosen.key, "steps": steps, "audit": audit, "seed": seed}
     _walk(chain, steps, folder / "chain.npz", json.dumps(about, sort_keys=True), fresh=fresh)
-    echo(f"model: {chosen}")
-    _conclude(chain, folder, training.cpu)
+    echo(f"model: {chosen}", f"answers: {by}")
+    _conclude(chain, folder, (training + compiling).cpu)
 
 
 def _trained_cell(problem: str, option: list[str] | None) -> Cell:

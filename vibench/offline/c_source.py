@@ -109,6 +109,7 @@ def source(
     members: Mapping[str, AffinePolynomial], arrays: Mapping[str, Array], about: Mapping[str, Any], stem: str,
     thetas: Mapping[str, AffinePolynomial] = MappingProxyType({}),
     exact: Mapping[str, ExactMember] = MappingProxyType({}), code: ContactCode | None = None,
+    sensors: Mapping[str, Any] = MappingProxyType({}),
 ) -> tuple[str, str]:  # fmt: skip
     """The C source of a model, and its header."""
     # The names of its functions begin with `stem`. With the `thetas` of a certificate it has error bounds. Members that
@@ -135,10 +136,10 @@ def source(
         "combination": _array("reduced_combination", np.zeros(0) if combination is None else combination),
         "degree": max((max(one.degrees) for one in own.values() if isinstance(one, AffinePolynomial)), default=0),
         "terms": max(-(-len(member.terms) // 4) * 4 for member in own.values()),
-        "accuracy": repr(float(about["accuracy"])), "factorised": int(factor.size > 0), "factor": _numbers(factor),
-        "lower": _numbers(arrays["lower"]), "upper": _numbers(arrays["upper"]),
+        "accuracy": repr(float(about["accuracy"])), "factorised": int(factor.size > 0), "factor": numbers(factor),
+        "lower": numbers(arrays["lower"]), "upper": numbers(arrays["upper"]),
         "members": "\n".join(_member(key, own[key]) for key in MEMBERS if key in own), "starts": len(parameters),
-        "start_parameters": _numbers(parameters), "start_sets": _numbers(sets, "char"),
+        "start_parameters": numbers(parameters), "start_sets": numbers(sets, "char"),
     }  # fmt: skip
     # A function that nothing calls would be a warning of the compiler.
     some = any(isinstance(one, AffinePolynomial) for one in own.values())
@@ -157,12 +158,15 @@ def source(
         parts.append("outputs")
     if thetas:
         values |= _certified({key: own[key] for key in thetas}, arrays) | {"guarantee": about["certificate"]}
-        kind, contacts = "scaled" if code is None else "on_contact", len(arrays["certificate_basis"])
-        values["certified_constraint"] = filled(f"reduced_model_{kind}.c", {"contacts": contacts})
-        values["scaled"] = int(code is None)
+        values["contacts"] = len(arrays["certificate_basis"])
+        kind, pair = ("scaled", "prepared_pair") if code is None else ("on_contact", "best_pair")
+        values["certified_constraint"] = filled(f"reduced_model_{kind}.c", values)
+        values["correction"] = filled(f"reduced_model_{pair}.c", values)
         parts += ["certificate", "certified_outputs"] if parts else ["certificate"]
     for kind, name in (("h", "declarations"), ("c", "code")):
         values[name] = "".join(filled(f"reduced_model_{part}.{kind}", values) for part in parts)
+    if sensors:
+        values["code"] += filled("reduced_model_sensors.c", {**values, **sensors})
     values["evaluated"] = "" if code is None else "; the code\n * of the problem evaluates B and g"
     header = filled("reduced_model.h", values)
     return filled("reduced_model.c", values | {"header": header}), header
@@ -191,14 +195,18 @@ def _certified(thetas: Mapping[str, AffinePolynomial | ExactMember], arrays: Map
     own.pop("certificate_lift", None)
     rows, (moved, loads) = len(own["certificate_generators"]), own["certificate_responses"].shape
     directions, kept = own["certificate_factor"].shape
+    # Where the best correction is computed at the parameter, its rows are independent.
+    near = len(own.get("certificate_near_compliance", ()))
+    largest = max(loads, chosen := min(rows, near))
     norms = own["certificate_norms"].size
     # Doubles on the stack of the certificate, for its documentation in the header.
-    numbers = loads * (loads + 1) // 2 + 8 * rows + 20 * loads + norms + kept
+    numbers = largest * (largest + 1) // 2 + chosen**2 + 14 * rows + 20 * (largest + near) + norms + kept
     sizes = dict.fromkeys(("theta_B", "theta_g"), 1)
     sizes |= {name: polynomial.terms.shape[1] for name, polynomial in thetas.items()}
     declared = len(arrays.get("certificate_term_errors", ()))
     return sizes | {
-        "rows": rows, "loads": loads, "moved": moved, "directions": directions, "kept": kept, "residual_terms": norms,
+        "rows": rows, "loads": loads, "near": near, "chosen": chosen, "largest": largest, "shifts": near or loads,
+        "moved": moved, "directions": directions, "kept": kept, "residual_terms": norms,
         "spectral": int("certificate_anchors" in arrays), "stack": round(8e-3 * numbers) + 1,
         "ranges": len(arrays.get("certificate_ranges", ())), "leading": len(own["certificate_turn"]),
         "declared": declared, "stiffness_terms": sizes["theta_A"] - declared,
@@ -217,7 +225,7 @@ def _table(name: str, table: Array | Indices | float) -> str:
 
 def _array(name: str, array: Array | Indices, kind: str = "") -> str:
     kind = kind or ("int" if array.dtype.kind in "iu" and array.ndim else "double")
-    return f"static const {kind} {name}[] = {{\n{_numbers(array, kind)}\n}};"
+    return f"static const {kind} {name}[] = {{\n{numbers(array, kind)}\n}};"
 
 
 def _member(name: str, member: AffinePolynomial | ExactMember) -> str:
@@ -258,7 +266,7 @@ def _is_single(rows: Array) -> Mask:
         return np.asarray((rows == rows.astype(np.float32)).all(axis=1))
 
 
-def _numbers(values: Array | Indices, kind: str = "double") -> str:
+def numbers(values: Array | Indices, kind: str = "double") -> str:
     """Numbers that a compiler reads back to the last bit."""
     # C has no arrays without elements.
     flat: Any = np.ravel(values if values.size else np.zeros(1)).astype({"float": "f", "double": "d"}.get(kind, "q"))

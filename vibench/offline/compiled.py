@@ -11,7 +11,7 @@ import os
 import shlex
 import shutil
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from vibench.interfaces.validation import training_parameters
 from vibench.model.chebyshev import AffinePolynomial
 from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel
 from vibench.offline import c_source
-from vibench.offline.c_source import contact_text
+from vibench.offline.c_source import ContactCode, contact_text
 from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, declared_model, member_polynomials
 from vibench.qp.exact import exact_solution
 from vibench.qp.verification import QPSolution
@@ -37,7 +37,10 @@ from vibench.text import one_line
 
 @dataclass(frozen=True)
 class CompiledModel:
-    """Data of the C source of a model: polynomials of A, f, B and g, and the accuracy that it verifies."""
+    """Data of the C source of a model: polynomials of A, f, B and g, and the accuracy that it verifies.
+
+    B and g have none where the problem has C code for them, which is that of a reduced model in the same process.
+    """
 
     members: Mapping[str, AffinePolynomial]
     # The box, `lower` and `upper` (d,), and those of `first_sets`.
@@ -54,27 +57,33 @@ class CompiledModel:
             queried = declared_model(reduced)
             if isinstance(queried, HyperReducedModel) and queried.space is not None:
                 raise RequestError("the enrichment changes the basis at every parameter")
-            polynomials = member_polynomials(queried, TOLERANCE, EVALUATIONS, check=_refuse_large)
+            coded = "" if ContactCode.of(queried) is None else "Bg"
+            members = member_polynomials(queried, TOLERANCE, EVALUATIONS, check=_refuse_large, left_out=coded)
         except RequestError as error:
             raise UnsupportedError(f"the model cannot be exported to C: {error}") from None
-        box, members = reduced.problem.parameters, {name: polynomials[name] for name in MEMBERS}
+        box = reduced.problem.parameters
         # Store polynomials and not the source: who loads an artefact runs nothing that is in it.
         arrays = {"lower": box.lower, "upper": box.upper, **first_sets(reduced, members)}
         return cls(members, arrays, accuracy)
 
-    @property
-    def source(self) -> str:
+    def source(self, reduced: AnyReducedModel | None = None) -> str:
         """The C source; its function is called `model_solve`."""
-        about: Mapping[str, Any] = {
-            "parameters": {"names": (), "units": ()}, "exported_by": "vibench",
-            "cell": dict.fromkeys(("problem", "dual", "primal", "cell"), "of this run"), "accuracy": self.accuracy,
-            "source": dict.fromkeys(("distribution", "licence"), "as the problem"),
-        }  # fmt: skip
-        return c_source.source(self.members, self.arrays, about, "model")[0]
+        code = None if reduced is None else ContactCode.of(reduced)
+        return c_source.source(self.members, self.arrays, about_model(self.accuracy), "model", code=code)[0]
 
-    def program(self) -> CompiledProgram:
+    def program(self, reduced: AnyReducedModel | None = None) -> CompiledProgram:
         """Compile and load the program; raises an `UnsupportedError` if there is no C compiler, or it fails."""
-        return CompiledProgram(self.source, *(self.members[name].terms.shape[1] for name in "fg"))
+        f, g = (self.members[name].terms.shape[1] if name in self.members else 0 for name in "fg")
+        return CompiledProgram(self.source(reduced), f, g if reduced is None else reduced.generators.shape[1])
+
+
+def about_model(accuracy: float, outputs: Sequence[Mapping[str, str]] = ()) -> dict[str, Any]:
+    """The texts of a source that stays in this process."""
+    return {
+        "parameters": {"names": (), "units": ()}, "exported_by": "vibench", "outputs": {"linear": list(outputs)},
+        "cell": dict.fromkeys(("problem", "dual", "primal", "cell"), "of this run"), "accuracy": accuracy,
+        "source": dict.fromkeys(("distribution", "licence"), "as the problem"),
+    }  # fmt: skip
 
 
 def first_sets(reduced: AnyReducedModel, members: Mapping[str, AffinePolynomial]) -> dict[str, Array]:
@@ -119,11 +128,8 @@ class CompiledProgram:
     """A program of `unknowns` and `constraints`, compiled and loaded; an `UnsupportedError` if the compiler fails."""
 
     def __init__(self, source: str, unknowns: int, constraints: int) -> None:
-        # A library that is loaded needs its file no longer.
-        with foreign("the C compiler, or what it makes, cannot be used"), scratch() as folder:
-            self._solve = ctypes.CDLL(str(compiled(source, folder))).model_solve_counting
+        self._solve = loaded(source, "model_solve_counting", 5)
         self._sizes = unknowns, constraints
-        self._solve.argtypes, self._solve.restype = [ctypes.c_void_p] * 5, ctypes.c_int
 
     def __call__(self, mu: Array) -> QPSolution:
         """The solution at mu (d,), verified by the program alone."""
@@ -144,9 +150,7 @@ def compiled_contact(source: ContactSource, shape: tuple[int, int]) -> Callable[
     """`Problem.contact` by its C source, with B of this shape; an `UnsupportedError` if the compiler fails."""
     wrapped = "int called(const double *mu, int *ends, int *columns, double *values, double *g)"
     text = f"#include <math.h>\n{contact_text(source)}{wrapped} {{ return contact(mu, ends, columns, values, g); }}"
-    with foreign("the C compiler, or what it makes,"), scratch() as folder:
-        call = ctypes.CDLL(str(compiled(text, folder))).called
-    call.argtypes = [ctypes.c_void_p] * 5
+    call = loaded(text, "called", 5)
 
     def contact(mu: Array) -> Contact | None:
         ends, columns = np.zeros(shape[0] + 1, np.intc), np.zeros(source.entries, np.intc)
@@ -158,6 +162,15 @@ def compiled_contact(source: ContactSource, shape: tuple[int, int]) -> Callable[
         return Contact(sp.csr_array((values[: ends[-1]], columns[: ends[-1]], ends), shape), g)
 
     return contact
+
+
+def loaded(source: str, name: str, pointers: int) -> Callable[..., int]:
+    """A function of so many pointers, of a source that is compiled and loaded into this process."""
+    # A library that is loaded needs its file no longer.
+    with foreign("the C compiler, or what it makes, cannot be used"), scratch() as folder:
+        found = ctypes.CDLL(str(compiled(source, folder)))[name]
+    found.argtypes = [ctypes.c_void_p] * pointers
+    return found
 
 
 def compiler() -> list[str]:

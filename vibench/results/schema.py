@@ -422,6 +422,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "audits": integer("Decisions by bounds that the high-fidelity model was asked all the same."),
         "wrong": integer("Decisions that the reduced model takes wrongly without bounds.", "wrong", 15),
         "claim": text("exact, for certified bounds, or no contradiction in so many audits.", "claim", 16),
+        "answered_by": text("C program, Python and why, or the model without bounds.", "answers", 19),
         "calibration_s": real("s", "Queries and questions of the chain.", "chain [s]", 17),
         "hf_chain_s": real("s", "The high-fidelity chain, at the mean of the questions.", "high-fidelity [s]", 18),
         "reason": text("Why there is no chain."),

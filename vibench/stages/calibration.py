@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibench.calibration.data import Prior, synthetic
-from vibench.calibration.decisions import BoundedSensors, Decisions, Predict, Prediction, Sensors
+from vibench.calibration.decisions import Decisions, Predict, Prediction, Sensors, quickest_sensors
 from vibench.calibration.metropolis import Metropolis
 from vibench.errors import NumericalError
 from vibench.offline.models import Model
@@ -44,7 +44,8 @@ class CalibrationStage(Stage):
         sensors = tuple(output.name for output in problem.outputs if output.linear)
         if not sensors:
             raise NumericalError("the problem has no linear outputs, which sensors have to be")
-        predict = _unbounded(model, sensors) if model.certificate is None else BoundedSensors(model, sensors)
+        unbounded = model.certificate is None
+        predict, by = (_unbounded(model, sensors), "model") if unbounded else quickest_sensors(model, sensors)
         exact = Sensors(problem, sensors).high_fidelity()(box.sample(1, seed)[0])
         rows: list[Row] = []
         for noise in (0.03, 0.01, 0.003):
@@ -57,7 +58,7 @@ class CalibrationStage(Stage):
             rows.append({
                 "noise": noise, "steps": chain.steps, "decisions": counts.decisions,
                 "asked": counts.undecided / max(counts.decisions, 1), "questions": len(decisions.answers),
-                "audits": counts.audits, "wrong": counts.wrong, "claim": decisions.claim,
+                "audits": counts.audits, "wrong": counts.wrong, "claim": decisions.claim, "answered_by": by,
                 "calibration_s": decisions.seconds, "hf_chain_s": decisions.high_fidelity_seconds,
             })  # fmt: skip
         return Result(tuple(rows))

@@ -47,7 +47,7 @@ class CompiledFormulationModel(ProgramModel):
 
     def __init__(self, offline: OfflinePhase, made: CompiledModel) -> None:
         super().__init__(offline.assembled)
-        self.call = _loaded(made.source, self.dimension, self.generators)
+        self.call = _loaded(made.source(self.reduced), self.dimension, self.generators)
 
     def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:  # noqa: ARG002
         """The solution at mu (d,), or what the program says without one."""

@@ -1,5 +1,6 @@
 """Decisions by bounds are those of the high-fidelity model; false bounds are caught; words say what is proved."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -14,7 +15,15 @@ from hypothesis.extra.numpy import arrays
 
 import vibench
 from vibench.calibration.data import Data, Prior
-from vibench.calibration.decisions import BoundedSensors, Decisions, Prediction, RefutedError, Sensors
+from vibench.calibration.decisions import (
+    BoundedSensors,
+    CompiledSensors,
+    Decisions,
+    Prediction,
+    RefutedError,
+    Sensors,
+    quickest_sensors,
+)
 from vibench.calibration.metropolis import Metropolis, summary
 from vibench.calibration.ranked import minimise
 from vibench.errors import RequestError
@@ -178,6 +187,38 @@ def test_queries_begin_with_the_last_solution_of_the_same_size(monkeypatch: pyte
     predict(TRUTH)
     assert starts[0] is starts[2] is None
     assert (starts[1][1] >= 0.0).all()
+
+
+@cache
+def compiled() -> CompiledSensors:
+    if shutil.which("cc") is None:
+        pytest.skip("needs a C compiler")
+    return CompiledSensors(bounded())
+
+
+def test_the_c_program_has_the_bounds_of_vibench() -> None:
+    assert bounded().model.certificate is not None
+    for mu in radial().parameters.sample(20, 2):
+        expected, found = bounded()(mu), compiled()(mu)
+        assert (np.abs(found.outputs - expected.outputs) <= found.bounds + expected.bounds).all()
+        # Corrected pairs have sharper ones, but for the accuracy of the high-fidelity solution.
+        assert (found.bounds <= expected.bounds * 1.001).all()
+        exact = Sensors(radial().problem, NAMES).high_fidelity()(mu)
+        assert (np.abs(exact - found.outputs) <= found.bounds).all()
+        assert found.guarantee is Guarantee.CERTIFIED
+    assert np.isinf(compiled()(radial().parameters.upper + 1.0).bounds).all()
+    whole, other = chain(compiled(), 0.003, STEPS), chain(bounded(), 0.003, STEPS)
+    assert np.array_equal(whole.states, other.states)
+    assert whole.decisions.claim == "exact"
+
+
+def test_without_a_compiler_python_answers_and_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler")
+    predict, by = quickest_sensors(radial(), NAMES)
+    assert isinstance(predict, BoundedSensors)
+    assert by == "Python: the environment variable CC names the C compiler 'no-such-compiler', which is not found"
+    with pytest.raises(RequestError, match="no output of the problem is called 'deflection'"):
+        quickest_sensors(radial(), ("deflection",))
 
 
 def test_what_has_no_bound_is_refused() -> None:

@@ -20,14 +20,15 @@ from running import Main, refused, succeeded
 from samples import with_ways
 
 import vibench
-from vibench.library import export, reduced_model
+from vibench.library import reduced_model
 from vibench.library.export import export_model
-from vibench.library.export import exported as exported_model
 from vibench.library.reduced_model import Model as Exported
 from vibench.model.affine import affine_decomposition
 from vibench.model.certificates.base import Guarantee
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
+from vibench.offline import exported as offline_exported
 from vibench.offline import polynomials
+from vibench.offline.exported import exported as exported_model
 from vibench.qp.exact import exact_solution
 
 FILES = {"model.npz", "reduced_model.py"}
@@ -478,7 +479,7 @@ def test_exported_members_and_their_certificate(run: vibench.Run) -> None:
     assert found.about["certificate"] == "certified"
     assert exported_model(obstacle, c=True).about["certificate"] == "verified"
     for exact, worth in (("Af", "verified"), ("AfB", "verified"), ("AfBg", "certified")):
-        assert export.guarantee(model.certificate, set(exact)).value == worth
+        assert offline_exported.guarantee(model.certificate, set(exact)).value == worth
 
 
 def test_the_code_of_the_page_runs(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,6 +21,7 @@ from vibench.qp.verification import verify
 from vibench.report.figures.data import of_solvers
 from vibench.stages.query import ModelQuery
 from vibench.timing import timed
+from vibench_problems.hertz import Hertz
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 
@@ -140,6 +141,19 @@ def test_programs_answer_say_what_they_cannot_and_are_repeated_near_by() -> None
         assert answer.x is not None
         assert answer.x[0] == pytest.approx(limit, rel=1e-14)
         assert seconds.cpu > 0.0
+
+
+def test_constraints_in_the_code_of_a_problem_are_in_the_program() -> None:
+    dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
+    few = vibench.create("sampling strategy", "random", {"size": 8, "seed": 1})
+    stops = vibench.Stop(tolerance=1e-2), vibench.Stop(tolerance=1e-1)
+    given = {"tolerance": 0.5, "training": few, "assembly": "reduced"}
+    form = vibench.create("formulation", "compiled")
+    model = vibench.Reduction(Hertz(300), dual, primal, *stops, formulation=form, **given).model
+    assert set(model.built["polynomials"].members) == {"A", "f"}
+    for mu in model.parameters.sample(3, seed=1):
+        found = model.solve(mu)
+        assert (found.status, found.reason, found.residuals.worst < 1e-12) == (Status.OK, "", True)
 
 
 def test_models_too_large_or_not_smooth_have_no_program(run: vibench.Run, monkeypatch: pytest.MonkeyPatch) -> None:
