@@ -32,5 +32,5 @@ class Diamonds(Blocks):
         corner = sizes.min(axis=1) < 0.5 * excess
         shrunk = np.maximum(sizes - np.where(corner, sizes.max(axis=1) - self.radii, 0.5 * excess)[:, None], 0.0)
         # Round-off must not leave a point outside.
-        total = np.maximum(shrunk.sum(axis=1), self.radii)
+        total = np.maximum(shrunk.sum(axis=1), np.asarray(self.radii))
         return np.asarray(np.copysign(shrunk * (self.radii / total * (1.0 - 4e-16))[:, None], inside))
