@@ -151,8 +151,8 @@ def test_dry_runs_list_the_matrix_and_lists_their_plugins(main: Main, tmp_path: 
     assert list(Path.cwd().iterdir()) == []
     out = succeeded(main("list"))
     assert [name for kind in PluginKind for name in registered(kind) if name not in out] == []
-    options = [option.name for option in find(kinds.PluginKind.PROBLEM, "obstacle").options.values()]
-    assert ", ".join(options) in out
+    options = find(kinds.PluginKind.PROBLEM, "obstacle").options
+    assert [name for name in options if f" {name}" not in out] == []
     _, out, _ = main("list", "problems")
     assert [name for name in options if f"{name}: " not in out] == []
     text = " ".join(out.split())
