@@ -52,7 +52,7 @@ def chain_of(decisions: Decisions, problem: vibench.Problem) -> tuple[Metropolis
 def reference(file: Path, problem: vibench.Problem, data: Data) -> tuple[np.ndarray, float, int]:
     """States and seconds of the chain of the high-fidelity model, and its solutions; computed once."""
     if not file.exists():
-        decisions = Decisions(problem, data, None, 0.0, 0)
+        decisions = Decisions(problem, data, (), 0.0, 0)
         chain, seconds = chain_of(decisions, problem)
         about = json.dumps({"command": made_by("calibration", "calibration")})
         counts = {"seconds": seconds, "solutions": len(decisions.answers)}

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import sqrt
 from pathlib import Path
 from typing import Annotated
 
@@ -81,15 +82,24 @@ class Data:
         """½ (s − d)ᵀ C⁻¹ (s − d) of outputs s (k,): the negative logarithm of the likelihood, up to a constant."""
         return self.interval(outputs, np.zeros(len(outputs)))[0]
 
-    def interval(self, outputs: Array, bounds: Array) -> tuple[float, float]:
-        """The least and the largest misfit that outputs (k,) with errors within `bounds` (k,) may have."""
+    def interval(self, outputs: Array, bounds: Array, correlation: Array | None = None) -> tuple[float, float]:
+        """The least and the largest misfit that outputs (k,) with errors e within `bounds` b (k,) may have.
+
+        With a `correlation` R (k×k) they satisfy (gᵀe)² ≤ cᵀRc for any g (k,) and c = (g_i b_i), too.
+        """
         if not np.isfinite(bounds).all():
             return 0.0, np.inf
         whitening: Array = self._whitening  # type: ignore[attr-defined]
         # With C = LLᵀ, each component of L⁻¹(s − d) moves by at most the sum of |L⁻¹| times the bounds.
-        size, reach = np.abs(whitening @ (outputs - self.values)), np.abs(whitening) @ bounds
-        least = np.maximum(size - reach, 0.0)
-        return 0.5 * float(least @ least), 0.5 * float((size + reach) @ (size + reach))
+        apart, reach = whitening @ (outputs - self.values), np.abs(whitening) @ bounds
+        least, most = np.maximum(np.abs(apart) - reach, 0.0), np.abs(apart) + reach
+        lower, upper = 0.5 * float(least @ least), 0.5 * float(most @ most)
+        if correlation is None:
+            return lower, upper
+        # The misfit moves by a linear term, and by a quadratic one that is not negative.
+        c, middle = (apart @ whitening) * bounds, 0.5 * float(apart @ apart)
+        linear = sqrt(max(0.0, float(c @ correlation @ c)) + 1e-6 * float(np.abs(c).sum()) ** 2)
+        return max(lower, middle - linear), min(upper, middle + linear + 0.5 * float(reach @ reach))
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ P follows from the reduced solution: ‖u‖ ≤ ‖u_N‖ + Δ_u, and with W �
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import inf, nan, sqrt
 from typing import Annotated, NamedTuple
@@ -48,16 +48,18 @@ from vibench.interfaces.formulations import FormulationAnswer
 from vibench.interfaces.parameters import outside
 from vibench.interfaces.problem import Problem
 from vibench.linalg import EPS
+from vibench.linalg.inner_product import InnerProduct
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee, output_coefficients, output_weights
 from vibench.model.certificates.bounds import OnlineBound, output_error_bound
 from vibench.model.galerkin import Evaluated, contact_at
 from vibench.model.hyperreduced import HyperReducedModel
+from vibench.model.proved_norms import ProvedNorms
 from vibench.offline import c_source
 from vibench.offline.compiled import loaded
 from vibench.offline.exported import exported
 from vibench.offline.models import Model
-from vibench.qp.verification import QPSolution
+from vibench.qp.verification import QPSolution, extended
 from vibench.signatures import Rule, Seed, constructed
 from vibench.stability.coercivity import share_of_diagonal
 from vibench.timing import timed
@@ -68,11 +70,15 @@ class RefutedError(NumericalError):
 
 
 class Prediction(NamedTuple):
-    """Outputs (k,) of a reduced model, bounds (k,) of their distances from the high-fidelity ones, and their worth."""
+    """Outputs (k,) of a reduced model, bounds (k,) of their distances from the high-fidelity ones, and their worth.
+
+    The `correlation` (k×k) of these distances is that of `Data.interval`.
+    """
 
     outputs: Array
     bounds: Array
     guarantee: Guarantee
+    correlation: Array | None = None
 
     @classmethod
     def without_bounds(cls, outputs: Array) -> Prediction:
@@ -129,6 +135,7 @@ class BoundedSensors:
         self._is_scaled, self._reach = self.base.bound_terms is not None, self._lengths(self.base.constraint)
         self._weights = [output_weights(problem, self.base, output) for output in outputs]
         of_u, of_lam = map(np.array, zip(*(output_coefficients(problem, output) for output in outputs), strict=True))
+        self.correlation = None if of_lam.any() else _correlation(self.base.X, of_u, np.array(self._weights)[:, 0])
         reduced, self._of_alpha = model.reduced, of_lam @ model.reduced.generators
         assert isinstance(reduced, HyperReducedModel)  # as certificates need it
         self._of_y = of_u @ reduced.basis
@@ -161,7 +168,7 @@ class BoundedSensors:
             return Prediction.without_bounds(outputs)
         widened = replace(bound, u_energy=bound.u_energy + delta, lam=bound.lam + delta / bound.inf_sup)
         bounds = [output_error_bound(weights, self.base, widened) for weights in self._weights]
-        return Prediction(outputs, np.array(bounds), bound.guarantee)
+        return Prediction(outputs, np.array(bounds), bound.guarantee, self.correlation)
 
     def _distance_of_computed(self, evaluated: Evaluated, lam: Array, bound: OnlineBound) -> float:
         """The δ of a reduced solution with the multiplier λ_N = `lam` (m,) and these bounds."""
@@ -187,6 +194,18 @@ class BoundedSensors:
         return np.asarray(sums, float), int(counts.max())
 
 
+def _correlation(X: InnerProduct, functionals: Array, norms: Array) -> Array | None:
+    """The products (k×k) of functionals (k×n) over upper bounds (k,) of their norms in X⁻¹; `None` if they are rough.
+
+    With p ≈ X⁻¹ℓ, ‖Σ c_i ℓ_i‖ ≤ ‖Σ c_i p_i‖ + Σ |c_i| ‖ℓ_i − X p_i‖: as in `vibench.model.proved_norms`.
+    """
+    proved, p = ProvedNorms(X.matrix, precise=True), extended(X.riesz(functionals.T))
+    lengths, lost = proved.energies(p, product := proved.A @ p)
+    # A tenth of what `Data.interval` adds.
+    is_sharp = bool((lost < 1e-7).all() and (lengths > (1.0 - 1e-7) * norms).all())
+    return np.asarray(p.T @ product, float) / np.outer(norms, norms) if is_sharp else None
+
+
 class CompiledSensors:
     """The outputs of `BoundedSensors` by a C program, compiled and loaded into this process: a query is one call.
 
@@ -208,7 +227,7 @@ class CompiledSensors:
         self._sensed, self._guarantee = loaded(text, "model_sensed", 4), Guarantee(found.about["certificate"])
         names = [output["name"] for output in found.about["outputs"]["linear"]]
         self._chosen = [names.index(name) for name in sensors.names]
-        self._found = np.zeros((2, len(names)))
+        self._found, self._correlation = np.zeros((2, len(names))), sensors.correlation
         # The active set of the last solution: steps are small.
         self._active = np.zeros(model.reduced.generators.shape[1] + 1, np.uint8)
 
@@ -217,7 +236,9 @@ class CompiledSensors:
         at = np.ascontiguousarray(mu, float)
         code = self._sensed(*(array.ctypes.data for array in (at, self._active, *self._found)))
         outputs, bounds = self._found[:, self._chosen]
-        return Prediction.without_bounds(outputs) if code else Prediction(outputs, bounds, self._guarantee)
+        if code:
+            return Prediction.without_bounds(outputs)
+        return Prediction(outputs, bounds, self._guarantee, self._correlation)
 
 
 def quickest_sensors(model: Model, names: tuple[str, ...]) -> tuple[Predict, str]:
@@ -237,6 +258,8 @@ class Interval:
     upper: float
     # The misfit of the reduced model, by which decisions without bounds are taken.
     middle: float
+    # Number of the models that were queried, one more once the high-fidelity model was asked.
+    level: int
 
     def below(self, other: Interval, shift: float) -> bool | None:
         """Whether this misfit is less than the other one plus a shift; `None` if the intervals do not decide."""
@@ -265,8 +288,9 @@ class Decisions:
     ----------
     problem, data
         The problem, and the data that its outputs are compared with.
-    predict
-        Outputs with bounds, as of `BoundedSensors`; `None` asks the high-fidelity model always.
+    models
+        Outputs with bounds, as of `BoundedSensors`, from the quickest model to the most accurate one: each is queried
+        where those before it leave a decision open. Without models the high-fidelity model is asked always.
     audit
         Share of the decided decisions, drawn at random, for which the high-fidelity model is asked all the same.
     seed
@@ -274,11 +298,11 @@ class Decisions:
     """
 
     def __init__(
-        self, problem: Problem, data: Data, predict: Predict | None,
+        self, problem: Problem, data: Data, models: Sequence[Predict],
         audit: Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)], seed: Seed,
     ) -> None:  # fmt: skip
         self.data, self.counts, self.guarantee = data, Counts(0, 0, 0, 0, 0.0), Guarantee.CERTIFIED
-        self._box, self._predict, self._audit = problem.parameters, predict, audit
+        self._box, self._models, self._audit = problem.parameters, tuple(models), audit
         self._ask, self._random = Sensors(problem, data.sensors).high_fidelity(), np.random.default_rng(seed)
         # Misfit and CPU seconds of the high-fidelity model by the bytes of the parameter: all that were asked, and
         # those that an interrupted run has asked before.
@@ -289,20 +313,31 @@ class Decisions:
 
     def interval(self, mu: Array) -> Interval:
         """Bounds of the misfit at mu (d,), ½ (s − d)ᵀ C⁻¹ (s − d); minus that is the log-likelihood."""
-        key, predict, known = mu.tobytes(), self._predict, Interval(0.0, inf, 0.0)
-        if key in self._recent:
-            return self._recent[key]
-        # Bounds are claimed in the box alone.
-        if predict is not None and not outside(self._box, mu).any():
-            (outputs, bounds, guarantee), seconds = timed(lambda: predict(mu))
-            self.counts.model_seconds += seconds.cpu
-            if guarantee is not Guarantee.CERTIFIED:
-                self.guarantee = Guarantee.VERIFIED
-            known = Interval(*self.data.interval(outputs, bounds), self.data.misfit(outputs))
-        if key in self.answers:
-            known.lower = known.upper = self.answers[key][0]
-        self._recent[key] = known
-        return known
+        if (key := mu.tobytes()) not in self._recent:
+            known = self._recent[key] = Interval(0.0, inf, 0.0, 0)
+            # Bounds are claimed in the box alone.
+            if outside(self._box, mu).any():
+                known.level = len(self._models)
+            elif self._models:
+                self._query(mu, known)
+            if key in self.answers:
+                known.lower = known.upper = self.answers[key][0]
+                known.level = len(self._models) + 1
+        return self._recent[key]
+
+    def _query(self, mu: Array, known: Interval) -> None:
+        """Narrow an interval by the next model."""
+        predict = self._models[known.level]
+        (outputs, bounds, guarantee, correlation), seconds = timed(lambda: predict(mu))
+        self.counts.model_seconds += seconds.cpu
+        if guarantee is not Guarantee.CERTIFIED:
+            self.guarantee = Guarantee.VERIFIED
+        lower, upper = self.data.interval(outputs, bounds, correlation)
+        if lower > known.upper or upper < known.lower:
+            both = f"{known.lower:.6g} to {known.upper:.6g} by one model, {lower:.6g} to {upper:.6g} by another one"
+            raise RefutedError(f"the bounds are refuted at mu = {mu.tolist()}: the misfit is {both}")
+        known.lower, known.upper = max(lower, known.lower), min(upper, known.upper)
+        known.middle, known.level = self.data.misfit(outputs), known.level + 1
 
     def ask(self, mu: Array) -> float:
         """The misfit of the high-fidelity model at mu (d,), which is kept; a `RefutedError` if bounds exclude it."""
@@ -314,6 +349,7 @@ class Decisions:
                 raise RefutedError(f"the bounds are refuted at mu = {mu.tolist()}: {found}")
             self.answers[key] = misfit, seconds
             known.lower = known.upper = misfit
+            known.level = len(self._models) + 1
         return self.answers[key][0]
 
     def _solved(self, mu: Array) -> tuple[float, float]:
@@ -328,18 +364,21 @@ class Decisions:
         one, other = self.interval(a), self.interval(b)
         verdict = one.below(other, shift)
         self.counts.decisions += 1
+        # Later decisions compare with b again, the present state of a chain: it is queried and asked first.
+        while verdict is None and min(one.level, other.level) < len(self._models):
+            self._query(*((b, other) if other.level <= one.level else (a, one)))
+            verdict = one.below(other, shift)
         if verdict is None:
             self.counts.undecided += 1
-            # Later decisions compare with b again, the present state of a chain: it is asked first.
             for mu in (b, a):
                 self.ask(mu)
                 if (verdict := one.below(other, shift)) is not None:
                     break
-        elif self._predict is not None and self._random.random() < self._audit:
+        elif self._models and self._random.random() < self._audit:
             self.counts.audits += 1
             self.ask(a)
             self.ask(b)
-        self.counts.wrong += bool(self._predict is not None and (one.middle < other.middle + shift) != verdict)
+        self.counts.wrong += bool(self._models and (one.middle < other.middle + shift) != verdict)
         return bool(verdict)
 
     @property

@@ -49,7 +49,7 @@ class CalibrationStage(Stage):
         exact = Sensors(problem, sensors).high_fidelity()(box.sample(1, seed)[0])
         rows: list[Row] = []
         for noise in (0.03, 0.01, 0.003):
-            decisions = Decisions(problem, synthetic(sensors, exact, noise, seed), predict, 0.01, seed)
+            decisions = Decisions(problem, synthetic(sensors, exact, noise, seed), (predict,), 0.01, seed)
             # As many steps as show a decision in a hundred.
             chain = Metropolis(decisions, Prior.of(box), 100, seed)
             while chain.steps < 400:

@@ -54,8 +54,8 @@ def test_a_model_without_bounds_walks_the_high_fidelity_chain_and_its_wrong_deci
     names = tuple(output.name for output in problem.outputs)
     exact = Sensors(problem, names).high_fidelity()(np.array([0.17, 0.1]))
     chains = []
-    for predict in (_unbounded(model, names), None):
-        decisions = Decisions(problem, synthetic(names, exact, 0.01, 1), predict, 0.01, 0)
+    for models in ((_unbounded(model, names),), ()):
+        decisions = Decisions(problem, synthetic(names, exact, 0.01, 1), models, 0.01, 0)
         chain = Metropolis(decisions, Prior.of(problem.parameters), 10, 5)
         while chain.steps < 60:
             chain.step()
