@@ -178,6 +178,7 @@ def test_plugins_whose_requirements_are_missing_are_unavailable(vibench: Vibench
     assert {row["reason"] for row in rows(folder / "runs" / "wire")} == {reason}
 
 
+@pytest.mark.long
 def test_edits_beside_numbers_run_none(vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures, help texts, the report and the tables may change: the run is complete, and its models open."""
     package, edited_core = Path(importlib.util.find_spec("vibench").submodule_search_locations[0]), tmp_path / "core"

@@ -53,6 +53,7 @@ def test_the_tests_of_new_packages_are_green(written: dict[str, Path], site: Pat
     assert f"{checks + len(NAMES)} passed" in done.stdout  # every package has one more test
 
 
+@pytest.mark.long
 def test_new_plugins_pass_their_checks_and_give_rows_as_they_are(vibench: Vibench, site: Path, tmp_path: Path) -> None:
     # one by the command; the tests of the packages above run the checks of all of them
     done = vibench(tmp_path, "check", "my-rope", plugins=site)
