@@ -96,7 +96,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory, artefacts: Path) -> Shared:
 
 @pytest.fixture(scope="session")
 def quick_run(shared: Shared) -> Path:
-    """Folder of one run of the study `quick`, timed in half the rounds of half the queries, through the command line; not drawn."""
+    """Folder of one run of `quick` with half its queries, timed in half the rounds, by the command line; not drawn."""
 
     def run(folder: Path) -> None:
         study = Path(registry.registered(PluginKind.STUDY)["quick"].load()).read_text(encoding="utf-8")

@@ -109,6 +109,7 @@ def test_a_new_formulation_with_programs_runs_as_the_mixed_one(tmp_path: Path) -
     assert (cells.loc["Coarse", "bound_online_violations"].dropna() == 0).all()
 
 
+@pytest.mark.long
 def test_formulations_are_timed_with_all_of_it_and_answer_again(found: Run) -> None:
     cells = found.table("cells").set_index(["formulation", "assembly"])
     for key in (("mixed", "full"), ("Program", "full"), ("Nearest", "full")):

@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from forking import run_pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from running import Main, Vibench, refused, rows, succeeded
 from samples import wire_study, write_study
@@ -101,6 +101,7 @@ BAD = ["", "Rope", "1rope", "rope_1", "rope-", "-rope", "my--rope", "ro pe", "..
 
 
 @given(st.from_regex(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", fullmatch=True) | st.text(max_size=12))
+@settings(max_examples=8)
 def test_a_name_that_is_accepted_is_good_everywhere(name: str) -> None:
     try:
         scaffold.check_name(PluginKind.DUAL, name)
