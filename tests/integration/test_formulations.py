@@ -139,6 +139,7 @@ def test_formulations_are_timed_with_all_of_it_and_answer_again(found: Run) -> N
         nearest.solve([5.0], solver="piqp")
 
 
+@pytest.mark.long
 def test_the_study_of_a_cell_is_the_same_cell_and_report_and_figures_take_it(found: Run, tmp_path: Path) -> None:
     for row in found.table("cells").to_dict("records"):
         cell = Cell.from_definition(row["definition"])
