@@ -23,8 +23,10 @@ EXPECTED = {
     for kind, (_, phases) in KINDS.items()
 }
 
-# Some hundred acts of formulations take minutes.
-EVERY = pytest.mark.parametrize("kind", [pytest.param("formulation", marks=pytest.mark.long), *list(KINDS)[1:]])
+# Some hundred acts of formulations take minutes, and the acts of strategies pass the same border as those of problems.
+EVERY = pytest.mark.parametrize(
+    "kind", ["problem", *(pytest.param(kind, marks=pytest.mark.long) for kind in KINDS if kind != "problem")]
+)
 Beside = Callable[..., Run]
 
 

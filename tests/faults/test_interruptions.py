@@ -26,7 +26,10 @@ def waiting(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize(("kill", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -9)])
+@pytest.mark.parametrize(
+    ("kill", "code"),
+    [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 130, marks=pytest.mark.long), (signal.SIGKILL, -9)],
+)
 def test_a_run_resumes(kill: signal.Signals, code: int, plugins_folder: Path, vibench: Vibench, waiting: Path) -> None:
     with forked(RUN, waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
@@ -96,7 +99,7 @@ def test_two_runs_do_not_write_into_one_folder(plugins_folder: Path, vibench: Vi
     assert "2 cells, all ok" in out
 
 
-@pytest.mark.parametrize("swapped", [False, True], ids=["removed", "swapped"])
+@pytest.mark.parametrize("swapped", [pytest.param(False, marks=pytest.mark.long), True], ids=["removed", "swapped"])
 def test_a_run_whose_folder_is_gone_ends(swapped: bool, plugins_folder: Path, vibench: Vibench, waiting: Path) -> None:
     """At the next commit; what was computed is in the store of artefacts, from which the next run takes it."""
     folder = waiting / "runs" / "wire"
@@ -137,7 +140,7 @@ sys.meta_path.insert(0, After())
 """What Python runs before a command that gets Ctrl-C at the first import after that of a module."""
 
 
-@pytest.mark.parametrize("module", ["typer", "vibench.cli.main", "numpy", "vibench.execution.run"])
+@pytest.mark.parametrize("module", ["typer", "numpy", pytest.param("vibench.execution.run", marks=pytest.mark.long)])
 def test_an_interrupt_among_the_imports_ends_the_command_with_a_line(
     module: str, command: str, plugins_folder: Path, waiting: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -57,6 +57,7 @@ def by_strategies(run: Path, table: str) -> dict[tuple[str, str, str], list[dict
     return found
 
 
+@pytest.mark.long
 def test_the_run_ends_with_a_row_for_every_cell_and_printable_names(ended: tuple[Path, str]) -> None:
     cells = {key: found for key, (found,) in by_strategies(ended[0] / "run", "cells").items()}
     cpg, own = printable(f"@{LABEL}"), printable(f"_{LABEL}")

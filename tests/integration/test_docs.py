@@ -248,9 +248,9 @@ def test_the_example_of_the_reference_is_a_study_and_its_rules_are_rules(tmp_pat
     [
         ("problem.md", 3, {"runs"}),
         ("method.md", 0, set()),
-        ("report.md", 5, {"runs", "tables", "decision.html", "answer.svg"}),
+        pytest.param("report.md", 5, {"runs", "tables", "decision.html", "answer.svg"}, marks=pytest.mark.long),
         ("measurement.md", 0, set()),
-        ("tolerances.md", 2, {"runs"}),
+        pytest.param("tolerances.md", 2, {"runs"}, marks=pytest.mark.long),
         ("calibration.md", 3, set()),
         ("methods.md", 36, {"points.npy"}),
     ],
@@ -340,6 +340,7 @@ def test_the_problem_and_the_strategy_of_the_readme_run(tmp_path: Path, monkeypa
     assert all(len([line for line in code.splitlines() if line]) <= 20 for code in codes)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("few_rounds")
 def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -26,7 +26,7 @@ def test_every_cell_has_accurate_queries_that_keep_the_invariants(cells: pd.Data
     assert set(cells["problem"]) == {"obstacle", "hertz"}
     assert set(cells["primal"]) == {"decorrelated", "online-supremizers", "offline-pga"}
     assert cells[["problem", "dual", "primal", "primal_tol", "solver"]].duplicated().sum() == 0
-    assert (cells["queries"] == 16).all()
+    assert (cells["queries"] == 8).all()
     ok = queries[queries["status"] == "ok"]
     assert len(ok) > 0.9 * len(queries)
     assert ok[["primal_residual", "dual_residual", "gap"]].max().max() <= 1e-7

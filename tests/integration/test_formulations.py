@@ -109,6 +109,7 @@ def test_a_new_formulation_with_programs_runs_as_the_mixed_one(tmp_path: Path) -
     assert (cells.loc["Coarse", "bound_online_violations"].dropna() == 0).all()
 
 
+@pytest.mark.long
 def test_formulations_are_timed_with_all_of_it_and_answer_again(found: Run) -> None:
     cells = found.table("cells").set_index(["formulation", "assembly"])
     for key in (("mixed", "full"), ("Program", "full"), ("Nearest", "full")):
@@ -138,6 +139,7 @@ def test_formulations_are_timed_with_all_of_it_and_answer_again(found: Run) -> N
         nearest.solve([5.0], solver="piqp")
 
 
+@pytest.mark.long
 def test_the_study_of_a_cell_is_the_same_cell_and_report_and_figures_take_it(found: Run, tmp_path: Path) -> None:
     for row in found.table("cells").to_dict("records"):
         cell = Cell.from_definition(row["definition"])

@@ -121,6 +121,7 @@ def test_the_same_classes_are_not_run_again_and_edited_ones_are(folder: Path) ->
     assert (after["code"] == before["code"])[~edited].all()
 
 
+@pytest.mark.long
 def test_other_processes_read_the_run_and_refuse_its_models_in_a_line(folder: Path, main: Main) -> None:
     out = str(folder / "out")
     code, printed, _ = main("show", out)

@@ -178,6 +178,7 @@ def test_plugins_whose_requirements_are_missing_are_unavailable(vibench: Vibench
     assert {row["reason"] for row in rows(folder / "runs" / "wire")} == {reason}
 
 
+@pytest.mark.long
 def test_edits_beside_numbers_run_none(vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures, help texts, the report and the tables may change: the run is complete, and its models open."""
     package, edited_core = Path(importlib.util.find_spec("vibench").submodule_search_locations[0]), tmp_path / "core"
@@ -210,7 +211,7 @@ def test_edits_beside_numbers_run_none(vibench: Vibench, tmp_path: Path, monkeyp
 def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) -> None:
     write_study(tmp_path, wire_study(
         problem=[{"name": "wire", "label": "long", "options": {"nodes": 40}}], solvers=["piqp", "osqp", "gives-up"],
-        primal=["online-supremizers", "offline-pga"],
+        primal=["offline-pga"],
         tolerances=[{"pod": [1e-3], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}],
     ))  # fmt: skip
     for jobs in ("1", "2"):

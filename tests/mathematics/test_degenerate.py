@@ -102,7 +102,9 @@ SIZES = {
 
 @pytest.mark.parametrize("case", SIZES)
 @pytest.mark.parametrize("dual", ["cpg", "mcpg"])
-@pytest.mark.parametrize("primal", ["decorrelated", "online-supremizers", "offline-pga"])
+@pytest.mark.parametrize(
+    "primal", ["decorrelated", pytest.param("online-supremizers", marks=pytest.mark.long), "offline-pga"]
+)
 def test_it_ends_in_ok_rows(rows, case: type[Wire], dual: str, primal: str) -> None:
     found = rows(case, dual, primal).cell
     assert (found["status"], found["queries_ok"]) == ("ok", 3)

@@ -62,9 +62,13 @@ def test_what_condensation_loses_is_won_back() -> None:
 
 EVERYWHERE = [(Bearing, 40), (Put, 40), (partial(ThermalBlock, 3), 9), (Torsion, 10), (Covered, 8)]
 """Problems whose constraint touches most unknowns; the stiffness of the block has nine parameters."""
+LONG = [
+    pytest.param(*case, marks=pytest.mark.long)
+    for case in [(Beam, 40), (DoubleObstacle, 50), *EVERYWHERE[:2], EVERYWHERE[4]]
+]
 
 
-@pytest.mark.parametrize(("make", "size"), [(Beam, 40), (Truss, 40), (DoubleObstacle, 50), *EVERYWHERE])
+@pytest.mark.parametrize(("make", "size"), [(Truss, 40), *EVERYWHERE[2:4], *LONG])
 def test_certified_models_of_hard_problems_have_bounds_that_hold(make: Make, size: int) -> None:
     """At online cost and at that of the mesh, of the pair and of the corrected one."""
     problem = make(size)

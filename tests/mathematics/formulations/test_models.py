@@ -267,7 +267,16 @@ def discs() -> list[Reduction]:
 
 @pytest.mark.parametrize(
     "formulation",
-    [Penalty(), Proximal(), SparseDictionary(), Local(2), Regression(), Regression("radial"), HyperReduced(1e-2)],
+    [
+        Penalty(),
+        Proximal(),
+        Local(2),
+        HyperReduced(1e-2),
+        *(
+            pytest.param(one, marks=pytest.mark.long)
+            for one in (SparseDictionary(), Regression(), Regression("radial"))
+        ),
+    ],
     ids=lambda formulation: " ".join([type(formulation).__name__, getattr(formulation, "kind", "")]).strip(),
 )
 def test_units_have_no_part_in_any_formulation(discs: list[Reduction], formulation: Formulation) -> None:

@@ -155,7 +155,7 @@ def test_forms_by_components_are_those_of_displacements() -> None:
         assert value == pytest.approx(np.sum(density * basis.dx), rel=1e-12)
 
 
-@pytest.mark.parametrize("mu", MUS, ids=str)
+@pytest.mark.parametrize("mu", [MUS[2], *(pytest.param(mu, marks=pytest.mark.long) for mu in MUS[:2])], ids=str)
 def test_force_axes_peak_and_far_field_agree_with_the_closed_form(mu: np.ndarray) -> None:
     """On the coarse mesh; `results/scripts/three_dimensions.py` has finer ones."""
     found, theory = problem(6).measured(solved(6, mu).lam), problem(6).theory(mu)
@@ -179,7 +179,7 @@ def test_the_force_converges_from_above_with_second_order() -> None:
     assert np.all(rates > 1.6)
 
 
-@pytest.mark.parametrize("poisson", [0.2, 0.4])
+@pytest.mark.parametrize("poisson", [0.2, pytest.param(0.4, marks=pytest.mark.long)])
 def test_the_slopes_of_the_paraboloid_act_as_a_first_variation_says(poisson: float) -> None:
     """With slopes s the constraint has −s·u besides: the energy grows by ∫ p s·u, the force by its derivative."""
     mu = np.array([4.0, 4.0, 0.00125 / 4.0, poisson])

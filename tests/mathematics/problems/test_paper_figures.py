@@ -119,11 +119,11 @@ def test_projection_errors_stand_beside_the_published_sizes(quick_run: Path) -> 
 def test_a_violated_inequality_differs(changed: Changed) -> None:
     path = changed(*OBSTACLE)
     statement = "β_on ≥ β_off ≥ β_dec and β_on ≥ β_HF, (19, 50), δ_PGA = 0.5"
-    everywhere = f"{statement}: over the span at all 16, over the cone at all 16"
+    everywhere = f"{statement}: over the span at all 8, over the cone at all 8"
     assert everywhere in twins(path, "obstacle")["figure-8"]().compared.partition("Differs: ")[0]
     path = changed(*OBSTACLE, "UPDATE queries SET beta_hf_span = 2.0 * beta_full_span WHERE query = 3")
     text = twins(path, "obstacle")["figure-8"]().compared
-    assert f"{statement}: over the span not at all, over the cone at all 16" in text.partition("Differs: ")[2]
+    assert f"{statement}: over the span not at all, over the cone at all 8" in text.partition("Differs: ")[2]
 
 
 NO_ORDER, VANISHES = "no order between β_off and β_HF", "N < R implies β_dec = 0, (19, 50), over the cone as in (14)"

@@ -133,7 +133,7 @@ def test_what_knows_contact_alone_says_so(coarse: Tresca, snapshots: Snapshots) 
         coarse.constant = declared  # type: ignore[misc]
 
 
-@pytest.mark.parametrize("dual", [HullGreedy(), PODDual()])
+@pytest.mark.parametrize("dual", [HullGreedy(), pytest.param(PODDual(), marks=pytest.mark.long)])
 def test_bounds_at_online_cost_hold_and_are_sharp(dual: DualStrategy, coarse: Tresca, snapshots: Snapshots) -> None:
     phase = Reduction(coarse, dual, OnlineSupremizers(), Stop(size=5), Stop(size=6), assembly="reduced", bounds=True)
     model, solver, found = phase.given(snapshots=snapshots).model, HighFidelitySolver(coarse), []

@@ -115,7 +115,13 @@ def assert_pga_keeps_its_promise(data: Offline, delta: float) -> None:
 
 @pytest.mark.parametrize(
     ("setting", "delta"),
-    [("varying", 0.95), ("varying", 0.5), ("varying", 1e-3), ("obstacle", 0.5), ("hertz", 0.95)],
+    [
+        ("varying", 0.95),
+        ("varying", 0.5),
+        ("varying", 1e-3),
+        ("obstacle", 0.5),
+        pytest.param("hertz", 0.95, marks=pytest.mark.long),
+    ],
 )
 def test_pga_keeps_its_promise_at_every_training_parameter(request, setting: str, delta: float) -> None:
     assert_pga_keeps_its_promise(request.getfixturevalue(setting), delta)

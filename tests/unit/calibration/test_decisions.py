@@ -36,7 +36,7 @@ from vibench_problems.radial import Radial
 TRUTH = np.array([0.17, 0.1])
 NAMES = ("inner deflection", "middle deflection", "outer deflection")
 NUMBERS = st.floats(-10.0, 10.0)
-STEPS = 200
+STEPS = 120
 
 
 @cache
@@ -96,7 +96,7 @@ def test_independent_noise_gives_the_interval_of_each_sensor_by_itself() -> None
     )
 
 
-@pytest.mark.parametrize("noise", [0.03, 0.003])
+@pytest.mark.parametrize("noise", [0.03, pytest.param(0.003, marks=pytest.mark.long)])
 def test_chains_by_bounds_are_those_of_the_high_fidelity_model(noise: float) -> None:
     exact, found = exact_chain(noise), chain(noise, STEPS, bounded())
     counts = found.decisions.counts

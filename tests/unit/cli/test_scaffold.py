@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from forking import run_pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from running import Main, Vibench, refused, rows, succeeded
 from samples import wire_study, write_study
@@ -53,6 +53,7 @@ def test_the_tests_of_new_packages_are_green(written: dict[str, Path], site: Pat
     assert f"{checks + len(NAMES)} passed" in done.stdout  # every package has one more test
 
 
+@pytest.mark.long
 def test_new_plugins_pass_their_checks_and_give_rows_as_they_are(vibench: Vibench, site: Path, tmp_path: Path) -> None:
     # one by the command; the tests of the packages above run the checks of all of them
     done = vibench(tmp_path, "check", "my-rope", plugins=site)
@@ -100,6 +101,7 @@ BAD = ["", "Rope", "1rope", "rope_1", "rope-", "-rope", "my--rope", "ro pe", "..
 
 
 @given(st.from_regex(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", fullmatch=True) | st.text(max_size=12))
+@settings(max_examples=8)
 def test_a_name_that_is_accepted_is_good_everywhere(name: str) -> None:
     try:
         scaffold.check_name(PluginKind.DUAL, name)

@@ -90,6 +90,7 @@ def test_local_workers_run_side_by_side(tmp_path: Path) -> None:
     assert not (tmp_path / "log").exists()  # nothing was printed
 
 
+@pytest.mark.long
 def test_a_cluster_somebody_has_is_used_and_left_alone(cluster: LocalCluster, tmp_path: Path) -> None:
     for k in range(2):
         workers = Dask(cluster.scheduler_address, 1, tmp_path)

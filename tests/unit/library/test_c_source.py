@@ -65,7 +65,7 @@ def compiled(file: Path, unknowns: int, constraints: int, strict: tuple[str, ...
     return solve
 
 
-PROBLEMS = ["radial-obstacle", "obstacle"]
+PROBLEMS = ["radial-obstacle", pytest.param("obstacle", marks=pytest.mark.long)]
 
 
 @pytest.fixture(scope="module", params=PROBLEMS)
@@ -415,7 +415,7 @@ def about(names: list[str], **cell: str) -> dict[str, Any]:
     return words | {"source": dict.fromkeys(source, "MIT"), "accuracy": 1e-9}
 
 
-@pytest.mark.parametrize("scale", [1e-6, 1e6])
+@pytest.mark.parametrize("scale", [1e-6, pytest.param(1e6, marks=pytest.mark.long)])
 @pytest.mark.parametrize("case", DEPENDENT)
 def test_any_constraints(case: str, scale: float, tmp_path: Path) -> None:
     """One source solves many programs, degenerate and contradictory ones among them: f and g are the parameters."""

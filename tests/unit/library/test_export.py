@@ -169,7 +169,13 @@ def largest_errors(model: vibench.Model, answers: Any, count: int) -> tuple[floa
 
 
 @pytest.mark.parametrize(
-    "way", ["radial-obstacle reduced 200", "radial-obstacle full 20", "obstacle reduced 40", "string - 100"]
+    "way",
+    [
+        "radial-obstacle reduced 200",
+        "radial-obstacle full 20",
+        "string - 100",
+        pytest.param("obstacle reduced 40", marks=pytest.mark.long),
+    ],
 )
 def test_an_exported_model_reproduces_random_queries(run: vibench.Run, way: str, tmp_path: Path) -> None:
     problem, assembly, count = way.split()

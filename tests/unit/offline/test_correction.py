@@ -15,19 +15,17 @@ from vibench.offline import solution as module
 from vibench.offline.assemblies import assemblies
 from vibench.offline.solution import Corrector
 
-PROBLEMS = [
-    {"name": "obstacle", "options": {"resolution": "coarse"}},
-    {"name": "hertz", "options": {"resolution": 300}},
-]
+RESOLUTIONS = {"obstacle": "coarse", "hertz": 300}
 BOUNDS = ("u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "online_lambda")
 ERRORS = {name: f"error_{name.removeprefix('online_')}_absolute" for name in BOUNDS}
 MODEL = ["problem", "pod_tol", "assembly"]
 
 
-@pytest.fixture(scope="module")
-def corrected(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
+@pytest.fixture(scope="module", params=["hertz", pytest.param("obstacle", marks=pytest.mark.long)])
+def corrected(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
+    problem = {"name": request.param, "options": {"resolution": RESOLUTIONS[request.param]}}
     study = small_study(
-        "corrected", PROBLEMS, primal=["offline-pga"], assembly=["reduced"], bounds=[False, True],
+        "corrected", [problem], primal=["offline-pga"], assembly=["reduced"], bounds=[False, True],
         validation=4, timing_rounds=1,
         correction=["none", "feasible", "auto"],
         tolerances=[{"pod": [1e-2, 1e-4], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}],
@@ -55,8 +53,9 @@ def test_corrected_rows_are_feasible_within_bounds_and_say_what_they_cost(correc
     assert (rows["bound_online_omega"].dropna() == 0.0).all()
     at_mesh = rows.index.get_level_values("assembly") == "reduced"
     assert (rows["bound_omega"][at_mesh] <= 1e-9 * plain["bound_omega"].max()).all()
-    obstacle = rows.loc[("obstacle", 1e-4)]["error_lambda"] / plain.loc[("obstacle", 1e-4)]["error_lambda"]
-    assert obstacle.median() < 0.2
+    if "obstacle" in set(corrected.cells["problem"]):
+        finer = rows.loc[("obstacle", 1e-4)]["error_lambda"] / plain.loc[("obstacle", 1e-4)]["error_lambda"]
+        assert finer.median() < 0.2
     cells = with_ways(corrected.cells).set_index(["assembly", "correction"]).sort_index()
     for assembly, correction in product(("reduced", "certified"), ("none", "feasible", "auto")):
         mine = cells.loc[[(assembly, correction)]]
@@ -72,6 +71,9 @@ def test_auto_corrects_where_the_violation_dominates_the_bound_and_leaves_the_ot
     rows, plain, pairs = (by(corrected, name) for name in ("auto", "none", "feasible"))
     assert (rows["corrected"] == (rows["correction_share"] > 1.0)).all()
     assert set(rows["corrected"]) == {0, 1}
+    # The bounds at online cost are of the pair, whose violation is zero, not of the reduced solution.
+    assert (pairs["bound_online_omega"].dropna() == 0.0).all()
+    assert plain["bound_online_omega"].max() > 0.0
     at_mesh = rows.index.get_level_values("assembly") == "reduced"
     assert np.allclose(rows["correction_share"][at_mesh], (plain["bound_omega"] / plain["bound_rho"])[at_mesh])
     online = (plain["bound_online_omega"] / plain["bound_online_rho"])[~at_mesh]
@@ -85,11 +87,9 @@ def test_auto_corrects_where_the_violation_dominates_the_bound_and_leaves_the_ot
         assert cells.loc[(*model, "auto"), "corrected_share"] == share
 
 
-@pytest.mark.parametrize("problem", ["obstacle", "hertz"])
-def test_models_answer_as_their_cells_and_bounds_hold_where_unseen(corrected: vibench.Run, problem: str) -> None:
-    cells = with_ways(corrected.cells[corrected.cells["problem"] == problem]).set_index(
-        ["pod_tol", "assembly", "correction"]
-    )
+def test_models_answer_as_their_cells_and_bounds_hold_where_unseen(corrected: vibench.Run) -> None:
+    cells = with_ways(corrected.cells).set_index(["pod_tol", "assembly", "correction"])
+    (problem,) = set(cells["problem"])
     for tolerance, assembly in product((1e-2, 1e-4), ("reduced", "certified")):
         model = corrected.model(cells.loc[(tolerance, assembly, "feasible"), "cell"])
         V, W = model.problem.V, model.problem.W

@@ -382,7 +382,7 @@ def test_without_contact_errors_of_u_are_drawn_alone(change: Change, draw: Draw)
 
 
 def test_a_profile_ends_at_the_share_that_was_solved(change: Change, draw: Draw) -> None:
-    change(ONE_PAIR, "UPDATE queries SET status = 'failed' WHERE solver = 'osqp' AND query < 4")
+    change(ONE_PAIR, "UPDATE queries SET status = 'failed' WHERE solver = 'osqp' AND query < 2")
     profile = draw("solvers")["obstacle-solvers"].axes[1]
     assert line_called(profile, "osqp").get_ydata()[-1] == pytest.approx(0.75)
     assert line_called(profile, "piqp").get_ydata()[-1] == pytest.approx(1.0)

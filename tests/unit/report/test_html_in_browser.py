@@ -98,7 +98,9 @@ def choose(browser: Chrome, axis: str, value: str) -> None:
     label.find_element(By.XPATH, f".//option[normalize-space(.)='{value}']").click()
 
 
-@pytest.mark.parametrize(("width", "themes"), [(1280, ("light", "dark")), (390, ("dark", "light"))])
+@pytest.mark.parametrize(
+    ("width", "themes"), [pytest.param(1280, ("light", "dark"), marks=pytest.mark.long), (390, ("dark", "light"))]
+)
 def test_nothing_is_cut_or_wrapped_in_numbers(width: int, themes: tuple[str, str], browser: Chrome, made: Path) -> None:
     """In the scheme in which the page is opened, and in the other one, to which it changes with the user."""
     look(browser, made, width=width, theme=themes[0])

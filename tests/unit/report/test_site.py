@@ -91,6 +91,7 @@ OBSERVE = """
 """
 
 
+@pytest.mark.long
 def test_a_browser_shows_every_page_and_filters_without_an_error(site: Path, browser: Chrome) -> None:
     pages = ("index.html", "leaderboard.html", "comparison.html", "runs/server-1/index.html")
     for page, width in product(pages, (1280, 500)):

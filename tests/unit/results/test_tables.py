@@ -303,7 +303,7 @@ def test_latex_of_a_run_compiles(view: str, quick_run: Path, tmp_path: Path) -> 
 
 
 def test_a_real_run_exports_its_whole_matrix_and_times_what_its_cells_are_made_of(quick_run: Path) -> None:
-    expected = expand(read_study("quick"))
+    expected = expand(read_study(str(quick_run.with_suffix(".toml"))))
     frame = pd.read_csv(quick_run / "tables" / "cells.csv")
     assert set(frame["cell"]) == {cell.key for cell in expected}
     assert len(pd.read_csv(quick_run / "tables" / "queries.csv")) == frame["queries"].sum()

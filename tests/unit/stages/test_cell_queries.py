@@ -102,7 +102,7 @@ def test_a_query_whose_assessment_fails_costs_itself(tmp_path: Path, monkeypatch
         assert found.queries[k]["error_u"] == pytest.approx(whole.queries[k]["error_u"], rel=1e-9)
 
 
-@pytest.mark.parametrize("certified", [False, True])
+@pytest.mark.parametrize("certified", [pytest.param(False, marks=pytest.mark.long), True])
 def test_a_large_cell_is_assessed_in_parts(certified: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Factors of as many parameters as fit are held at a time; rows are those of all at once."""
     problem = Plugin("problem", "hertz", '{"resolution": "coarse"}', "test")

@@ -156,8 +156,11 @@ def test_constraints_in_the_code_of_a_problem_are_in_the_program() -> None:
         assert (found.status, found.reason, found.residuals.worst < 1e-12) == (Status.OK, "", True)
 
 
-def test_models_too_large_or_not_smooth_have_no_program(run: vibench.Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    reduced = run.model(str(run.cells["cell"].iloc[0])).reduced
+def test_models_too_large_or_not_smooth_have_no_program(
+    small_run: vibench.Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cells = small_run.cells.set_index("assembly")["cell"]
+    reduced = small_run.model(str(cells["reduced"].iloc[0])).reduced
 
     def interpolated(*_: object, **__: object) -> None:
         raise AssertionError("a model that is too large was interpolated before it was refused")

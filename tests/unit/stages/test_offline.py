@@ -227,7 +227,7 @@ class Factorising(HighFidelitySolver):
         return super().solve_assembled(mu, vi)
 
 
-@pytest.mark.parametrize("extra", [0.0, 5.0])
+@pytest.mark.parametrize("extra", [pytest.param(0.0, marks=pytest.mark.long), 5.0])
 @pytest.mark.parametrize(("role", "count"), [("training", 0), ("validation", 4), ("validation", 18)])
 def test_the_set_up_and_a_start_without_contact_set_are_no_part_of_the_seconds_of_a_solution(
     role: Literal["training", "validation"], count: int, extra: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

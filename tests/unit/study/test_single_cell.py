@@ -25,7 +25,8 @@ def test_a_study_of_one_cell_has_the_same_cell(name: str) -> None:
 
 
 def test_a_row_is_made_again_from_its_results_file_or_an_older_definition(quick_run: Path, main: Main) -> None:
-    cell = expand(read_study("quick"))[0]
+    named = str(quick_run.with_suffix(".toml"))
+    cell = expand(read_study(named))[0]
     older = json.loads(cell.definition)
     for name in ("training", "validation_sampling", "set_labels", "formulation", "formulation_label", "bounds"):
         del older[name]
@@ -36,7 +37,7 @@ def test_a_row_is_made_again_from_its_results_file_or_an_older_definition(quick_
     study = recorded_study(str(quick_run / FILE), row["cell"][:6])
     assert [cell.key for cell in expand(study)] == [row["cell"]]
     assert (study.name, study.timing_rounds) == ("quick", row["timing_rounds"])
-    for source, key in ((str(quick_run / FILE), row["cell"][:6]), ("quick", row["cell"])):
+    for source, key in ((str(quick_run / FILE), row["cell"][:6]), (named, row["cell"])):
         out = succeeded(main("run", source, "--cell", key, "--dry-run"))
         assert out == f"{row['cell']}  {formats.name_of_cell(row)}\n1 cells\n"
 
@@ -45,7 +46,7 @@ def test_a_cell_is_found_by_its_beginning_or_refused(quick_run: Path, changed: C
     results = str(quick_run / FILE)
     refused(main("run", results, "--cell", "xyz"), "0 cells", "begin with 'xyz'", "expected one")
     refused(main("run", "quick", "--cell", "xyz"), "0 cells of 'quick' begin", "`vibench run quick --dry-run` lists")
-    ((digit, count),) = Counter(key[0] for key in read_table(quick_run / FILE, "cells")["cell"]).most_common(1)
+    ((digit, count),) = Counter(cell.key[0] for cell in expand(read_study("quick"))).most_common(1)
     refused(main("run", "quick", "--cell", digit, "--dry-run"), f"{count} cells of 'quick' begin with '{digit}'")
     refused(main("run", results, "--cell", "a", "--solver", "piqp"), "leave out solvers")
     for definition in ("", "[]", "{}", '{"problem": 3}'):

@@ -25,7 +25,23 @@ from vibench.testing.case import difference, find_jump
 from vibench.testing.checks import Check, Doubt, Note, Verdict
 
 SLOW = dict.fromkeys(
-    ("compiled", "greedy", "hertz3d", "infsup-greedy", "nmf", "regression", "tresca"), pytest.mark.long
+    (
+        "bearing",
+        "bulge",
+        "compiled",
+        "enlarged-cpg",
+        "greedy",
+        "hertz",
+        "hertz3d",
+        "hyper-reduced",
+        "infsup-greedy",
+        "nmf",
+        "obstacle",
+        "regression",
+        "tresca",
+        "two-spheres",
+    ),
+    pytest.mark.long,
 )
 
 BUILT_IN = [
