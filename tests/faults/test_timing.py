@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from running import Vibench, by_solver, rows, run_wire
+from running import Vibench, by_solver, execute, rows, run_wire
 from samples import ROUNDS, wire_study
 
 ANSWERS = 6
@@ -28,3 +28,26 @@ def test_a_solver_that_dies_in_a_round_costs_that_round(
     assert min(unlucky["online_s"], other["online_s"]) > 0.0
     timed = [row["solver"] for row in rows(tmp_path / "runs" / "wire", "timings")]
     assert (timed.count("dies-once"), timed.count("piqp")) == (ROUNDS - lost, ROUNDS)
+
+
+@pytest.mark.long
+def test_what_was_never_answered_or_timed_leaves_the_others_or_is_timed_next(vibench: Vibench, tmp_path: Path) -> None:
+    study = wire_study(solvers=["dies", "raises", "piqp"], dual=["cone-raises", "cpg"])
+    (tmp_path / "other").mkdir()
+    found = {(row["dual"], row["solver"]): row for row in run_wire(vibench, tmp_path / "other", study=study)[1]}
+    assert len(found) == 6
+    assert [key for key, row in found.items() if row["online_s"] is not None] == [("cpg", "piqp")]
+    assert found["cpg", "piqp"]["timing_rounds"] == ROUNDS
+    # As after an interruption between the last answer and the first round; a study may ask for more rounds.
+    folder = tmp_path / "runs" / "wire"
+    run_wire(vibench, tmp_path, study=wire_study())
+    execute(folder, "UPDATE cells SET timing_rounds = NULL, online_s = NULL", "DELETE FROM timings")
+    printed, (row,) = run_wire(vibench, tmp_path)
+    assert "1 cells, 0 to run, 1 stages" in printed
+    assert row["online_s"] > 0.0
+    assert len(rows(folder, "timings")) == ROUNDS
+    assert "1 cells, 0 to run, 0 stages" in run_wire(vibench, tmp_path)[0]
+    assert {row["meaning"] for row in rows(folder, "thresholds")} == {"undecided"}
+    assert "0 to run, 1 stages" in run_wire(vibench, tmp_path, study=wire_study(timing_rounds=7))[0]
+    assert len(rows(folder, "timings")) == 7
+    assert {row["timing_rounds"] for row in rows(folder)} == {7}
