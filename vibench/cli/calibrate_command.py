@@ -52,37 +52,30 @@ def calibrate(
     # What is not installed is said before the training.
     arviz()
     recorded = recorded_cell(problem, cell) if cell else None
-    chosen = _trained_cells(problem, option) if recorded is None else [recorded.cell]
-    target = build_problem(chosen[0].problem)
+    chosen = _trained_cell(problem, option) if recorded is None else recorded.cell
+    target = build_problem(chosen.problem)
     if synthetic:
         _write_synthetic(target, synthetic, share(noise), data, seed)
     measured, prior = read_data(data, target)
     # Shown on a terminal alone: training may take a minute.
-    with new_console().status(f"model: {chosen[-1]}"):
-        models, training = timed(lambda: [cell_model(one) for one in chosen] if recorded is None else [recorded.model])
+    with new_console().status(f"model: {chosen}"):
+        model, training = timed(lambda: cell_model(chosen) if recorded is None else recorded.model)
     with placed(str(data)):
-        solved = models[-1].offline.snapshots
+        solved = model.offline.snapshots
         sensors = outputs_of(target, measured.sensors)
         refuse_unreachable(measured, [one.values(solved.mu, solved.u, solved.lam) for one in sensors])
         # Compiling is part of the training.
-        found, compiling = timed(lambda: [quickest_sensors(model, measured.sensors) for model in models])
-    decisions = Decisions(target, measured, [predict for predict, _ in found], share(audit), seed)
+        (predict, by), compiling = timed(lambda: quickest_sensors(model, measured.sensors))
+    decisions = Decisions(target, measured, [predict], share(audit), seed)
     chain, folder = Metropolis(decisions, prior, steps // 5, seed), out or Path("calibrations") / data.stem
-    about = {
-        "data": data.read_text(encoding="utf-8"),
-        "cell": chosen[-1].key,
-        "steps": steps,
-        "audit": audit,
-        "seed": seed,
-    }
+    about = {"data": data.read_text(encoding="utf-8"), "cell": chosen.key, "steps": steps, "audit": audit, "seed": seed}
     _walk(chain, steps, folder / "chain.npz", json.dumps(about, sort_keys=True), fresh=fresh)
-    for one, (_, by) in zip(chosen, found, strict=True):
-        echo(f"model: {one}", f"answers: {by}")
+    echo(f"model: {chosen}", f"answers: {by}")
     _conclude(chain, folder, (training + compiling).cpu)
 
 
-def _trained_cells(problem: str, option: list[str] | None) -> list[Cell]:
-    """The smallest and the largest model of the study `calibration` for a problem of the command line."""
+def _trained_cell(problem: str, option: list[str] | None) -> Cell:
+    """The cell of the study `calibration` for a problem of the command line."""
     from vibench.cli.run_command import problem_entry
     from vibench.study.matrix import expand, read_study
 
@@ -91,8 +84,7 @@ def _trained_cells(problem: str, option: list[str] | None) -> list[Cell]:
         if not isinstance(entry, str):
             raise RequestError("--option is for a problem by its name; a class or a pack has its own")
         entry = {"name": entry, "options": dict(map(key_value, option))}
-    largest, *others = expand(read_study("calibration", {"problem": [entry]}))
-    return [[cell for cell in others if cell.formulation == largest.formulation][-1], largest]
+    return expand(read_study("calibration", {"problem": [entry]}))[0]
 
 
 def _write_synthetic(problem: Problem, mu: str, noise: float, file: Path, seed: int) -> None:
