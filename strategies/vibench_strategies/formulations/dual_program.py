@@ -87,7 +87,7 @@ class DualProgramModel(PhasesModel):
 
     def _in_section(self, settings: QuerySettings, Y: Array, load: Array, g: Array) -> FormulationAnswer:
         """Solve exactly; where the solver misses the accuracy by proximal steps, whose Hessian is the identity."""
-        q, (T, sigma) = Y.T @ load - g, proximal_factor(Y)
+        q, (T, sigma) = Y.T @ load - g, proximal_factor(Y, 1e-4)
         # The accuracy of a solver means nothing in directions that are round-off.
         if np.linalg.matrix_rank(Y, tol=1e-7 * np.linalg.norm(Y)) < self._R:
             return FormulationAnswer.none("the reduced compliance B A⁻¹Bᵀ is singular: enrich V_N, or take more modes")
@@ -103,12 +103,13 @@ class DualProgramModel(PhasesModel):
             found = solved_step(settings, VariationalInequality(np.eye(self._R), f, rows, self._bounds))
             return found, alpha if found.x is None else inverse @ found.x
 
-        return proximal(step, Y, np.full(self._R, sigma), settings.accuracy)
+        return proximal(step, Y, np.full(self._R, sigma), settings.accuracy, 300)
 
     def _in_hull(self, settings: QuerySettings, Y: Array, load: Array, g: Array) -> FormulationAnswer:
         """Take proximal steps of α and ζ, in units of ζ such that the largest vertex has the energy 1."""
         R, lengths = self._R, np.linalg.norm(Y, axis=0)
-        _, sigma = proximal_factor(Y)
+        # Smaller than in a section, as the Hessian is the identity in any case: two or three steps.
+        _, sigma = proximal_factor(Y, 1e-6)
         vertices = np.divide(lengths, self._gauges, out=np.zeros(R), where=self._gauges > 0.0)
         energy = float(vertices.max(initial=0.0))
         shared = np.append(self._gauges * energy, 1.0)
@@ -121,7 +122,7 @@ class DualProgramModel(PhasesModel):
             found = solved_step(settings, VariationalInequality(identity, f, rows, bounds))
             return found, last if found.x is None or found.alpha is None else np.append(found.alpha[:R], found.x[-1])
 
-        return proximal(step, Y, np.append(np.full(R, sigma), 1.0 / (energy or 1.0)), settings.accuracy)
+        return proximal(step, Y, np.append(np.full(R, sigma), 1.0 / (energy or 1.0)), settings.accuracy, 30)
 
     def coordinates(self, mu: Array, answer: FormulationAnswer) -> tuple[Any, Array, Array]:
         """The reduced problem, x = A⁻¹(f − Bᵀα), and α on the generators of `reduced`: free ones have both signs.
@@ -133,7 +134,7 @@ class DualProgramModel(PhasesModel):
         assert answer.alpha is not None
         alpha = answer.alpha[: self._R]
         if not self._is_signed:
-            alpha = solve_triangular(proximal_factor(Y)[0], answer.x)
+            alpha = solve_triangular(proximal_factor(Y, 1e-4)[0], answer.x)
         gauge = self._K.gauge(self._chi @ alpha)
         # Sums over generators of both signs have a round-off of their own.
         alpha = alpha / (gauge * (1.0 + 1e-12)) if 1.0 - 1e-12 < gauge < np.inf else alpha
@@ -152,7 +153,7 @@ class DualProgramModel(PhasesModel):
 
 
 def proximal(
-    step: Callable[[Array], tuple[Any, Array]], Y: Array, weights: Array, accuracy: float
+    step: Callable[[Array], tuple[Any, Array]], Y: Array, weights: Array, accuracy: float, most: int
 ) -> FormulationAnswer:  # fmt: skip
     """Proximal steps from zero until they leave of the terms that they add, by their weights, less than the accuracy.
 
@@ -161,7 +162,7 @@ def proximal(
     """
     R, point, iterations = Y.shape[1], np.zeros(len(weights)), 0
     units = np.append(np.sqrt(np.square(Y).sum(axis=0) + weights[:R]), np.ones(len(weights) - R))
-    for _ in range(30):
+    for _ in range(most):
         last = point
         found, point = step(last)
         iterations += found.iterations or 0
@@ -170,7 +171,7 @@ def proximal(
         left, energy = weights * np.abs(point - last) / units, float(np.linalg.norm(Y @ point[:R]))
         if (left[:R] <= accuracy * energy).all() and (left[R:] <= accuracy).all():
             return FormulationAnswer(found.x, found.alpha, iterations=iterations)
-    reason = f"30 proximal steps leave {left.max():.1e} of the terms that they add"
+    reason = f"{most} proximal steps leave {left.max():.1e} of the terms that they add"
     return FormulationAnswer(found.x, found.alpha, Outcome.INACCURATE, reason, iterations)
 
 
@@ -182,9 +183,9 @@ def solved_step(settings: QuerySettings, program: VariationalInequality) -> Any:
     return found if met else settings.solve_qp(program, factor=program.A)
 
 
-def proximal_factor(Y: Array) -> tuple[Array, float]:
-    """The upper factor T (R×R) of Ŝ + σ, for the σ of the steps of a section: 1e-6 of the mean diagonal of Ŝ."""
-    sigma = 1e-6 * float(np.mean(np.square(Y).sum(axis=0))) if Y.size else 0.0
+def proximal_factor(Y: Array, share: float) -> tuple[Array, float]:
+    """The upper factor T (R×R) of Ŝ + σ, for σ a share of the mean diagonal of Ŝ."""
+    sigma = share * float(np.mean(np.square(Y).sum(axis=0))) if Y.size else 0.0
     return np.asarray(np.linalg.qr(np.vstack([Y, np.sqrt(sigma) * np.eye(Y.shape[1])]))[1]), sigma
 
 
