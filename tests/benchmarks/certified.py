@@ -157,10 +157,11 @@ def main(run: str, count: int, only: str = "", table: str | None = None) -> int:
     for recorded in recorded_cells(run):
         if only not in ("", recorded.row["problem"]):
             continue
-        certificate = recorded.certificate
-        if certificate is not None and recorded.row["correction"] == CorrectionMode.NONE:  # the model is the same
-            tally = Tally(recorded.row, opened.model(recorded.row["cell"]), certificate)
-            models.setdefault(recorded.cell.problem, []).append(tally)
+        if recorded.row["correction"] != CorrectionMode.NONE:  # the model is the same
+            continue
+        model = opened.model(recorded.row["cell"])
+        if model.certificate is not None:
+            models.setdefault(recorded.cell.problem, []).append(Tally(recorded.row, model, model.certificate))
     for tallies in models.values():
         problem = tallies[0].model.problem
         solver, kept = HighFidelitySolver(problem), Assemblies(problem)

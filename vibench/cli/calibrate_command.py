@@ -75,16 +75,24 @@ def calibrate(
 
 
 def _trained_cell(problem: str, option: list[str] | None) -> Cell:
-    """The cell of the study `calibration` for a problem of the command line."""
+    """The cell of the study `calibration` for a problem of the command line, with the defaults for its dual set."""
     from vibench.cli.run_command import problem_entry
+    from vibench.plugins.kinds import PluginKind
+    from vibench.plugins.registry import default_of
     from vibench.study.matrix import expand, read_study
+    from vibench.study.parameter_sets import blocks_of
 
     entry = problem_entry(problem)
     if option:
         if not isinstance(entry, str):
             raise RequestError("--option is for a problem by its name; a class or a pack has its own")
         entry = {"name": entry, "options": dict(map(key_value, option))}
-    return expand(read_study("calibration", {"problem": [entry]}))[0]
+    cell = expand(read_study("calibration", {"problem": [entry]}))[0]
+    if not (blocks := blocks_of(cell.problem)):
+        return cell
+    kinds = {"formulation": PluginKind.FORMULATION, "dual": PluginKind.DUAL}
+    named = {key: [default_of(kind, blocks)] for key, kind in kinds.items()}
+    return expand(read_study("calibration", {"problem": [entry], **named}))[0]
 
 
 def _write_synthetic(problem: Problem, mu: str, noise: float, file: Path, seed: int) -> None:

@@ -101,9 +101,21 @@ def test_reduced_multipliers_stay_in_the_set(coarse, snapshots, dual, primal) ->
 
 def test_without_an_enrichment_that_is_needed_the_answer_says_so(coarse: Tresca, snapshots: Snapshots) -> None:
     phase = Reduction(coarse, PODDual(), None, Stop(size=3), Stop(size=5), formulation=DualProgram())
-    answer = phase.given(snapshots=snapshots).model.solve(np.array([0.8, 0.55]))
-    assert answer.status.value == "failed"
-    assert "is singular: enrich V_N" in answer.reason
+    with pytest.raises(UnsupportedError, match="5 multipliers of a section need as many vectors, not 3: enrich V_N"):
+        phase.given(snapshots=snapshots).model.solve(np.array([0.8, 0.55]))
+
+
+@pytest.mark.parametrize("dual", [HullGreedy(), PODDual()])
+def test_every_solver_meets_the_default_accuracy(dual: DualStrategy, coarse: Tresca, snapshots: Snapshots) -> None:
+    # More generators than the snapshots need: they are nearly dependent.
+    phase = Reduction(coarse, dual, OnlineSupremizers(), Stop(size=10), Stop(size=12), formulation=DualProgram())
+    model, mus = phase.given(snapshots=snapshots).model, coarse.validation_set(3, 5)
+    exact = [model.solving("daqp").solve(mu) for mu in mus]
+    for solver in ("daqp", "piqp", "osqp", "proxqp"):
+        for mu, other in zip(mus, exact, strict=True):
+            answer = model.solving(solver).solve(mu)
+            assert answer.status.value == "ok", (solver, answer.reason)
+            assert coarse.V.norm(answer.u - other.u) < 1e-3 * coarse.V.norm(other.u)
 
 
 def test_for_contact_the_dual_program_answers_as_the_mixed_one() -> None:

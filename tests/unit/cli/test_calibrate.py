@@ -15,6 +15,7 @@ from running import Main, refused
 from vibench.calibration import Metropolis
 from vibench.calibration.data import read_data
 from vibench.calibration.metropolis import arviz
+from vibench.cli.calibrate_command import _trained_cell
 from vibench.errors import RequestError
 from vibench_problems.hertz import Hertz
 from vibench_problems.radial import Radial
@@ -139,6 +140,12 @@ def test_outputs_without_bounds_are_refused_before_a_model_is_trained(
 
 def _lines(values: dict[str, Any]) -> str:
     return "".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items())
+
+
+def test_where_multipliers_are_bounded_the_model_is_the_default_of_that_set() -> None:
+    cell = _trained_cell("tresca", ["resolution=coarse"])
+    assert (cell.dual.name, cell.formulation_label) == ("hull-greedy", "dual-program")
+    assert _trained_cell("radial-obstacle", None).dual.name == "mcpg"
 
 
 def test_data_with_a_covariance_and_a_prior_are_read(tmp_path: Path) -> None:
