@@ -51,12 +51,12 @@ from .interfaces.problem import Problem as Problem
 from .interfaces.problem import Sampler as Sampler
 from .interfaces.problem import VariationalInequality as VariationalInequality
 from .interfaces.strategies import AdaptiveSampling as AdaptiveSampling
-from .interfaces.strategies import Cone as Cone
 from .interfaces.strategies import DualStrategy as DualStrategy
 from .interfaces.strategies import Enrichment as Enrichment
 from .interfaces.strategies import Kind as Kind
 from .interfaces.strategies import Offline as Offline
 from .interfaces.strategies import PrimalStrategy as PrimalStrategy
+from .interfaces.strategies import ReducedSet as ReducedSet
 from .interfaces.strategies import Sampling as Sampling
 from .interfaces.strategies import Stop as Stop
 from .interfaces.strategies import Trainer as Trainer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, greedy_cone
+from vibench import Array, DualStrategy, InnerProduct, ReducedSet, Stop, greedy_cone
 from vibench_strategies.snapshot_cones import normalised, projection_errors
 
 
@@ -15,7 +15,7 @@ class AngleGreedy(DualStrategy):
     own norm. The reported errors are relative to the largest norm, as for every dual strategy.
     """
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         """Add the snapshot that makes the largest angle with the cone until all angles are small enough."""
         cone = greedy_cone(normalised(snapshots, W), W, stop)
         return replace(cone, errors=projection_errors(cone.generators, snapshots, W))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, no_free
+from vibench import Array, DualStrategy, InnerProduct, ReducedSet, Stop, no_free
 from vibench_strategies.snapshot_cones import normalised, projection_errors
 
 
@@ -12,7 +12,7 @@ class Dictionary(DualStrategy):
     All snapshots together meet every tolerance; a size keeps that many, in the order of the training set.
     """
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         """Normalise the snapshots and drop those that are zero."""
         generators = normalised(snapshots, W)[:, : stop.size]
-        return Cone(generators, projection_errors(generators, snapshots, W), no_free(generators.shape[1]))
+        return ReducedSet(generators, projection_errors(generators, snapshots, W), no_free(generators.shape[1]))

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge
 
-from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, greedy_cone, no_free, project_on_cone
+from vibench import Array, DualStrategy, InnerProduct, ReducedSet, Stop, greedy_cone, no_free, project_on_cone
 from vibench.reduction import subtract_cone_component
 from vibench_strategies.snapshot_cones import projection_errors
 
@@ -25,7 +25,7 @@ class EnlargedCPG(DualStrategy):
     def __init__(self, sweeps: Annotated[int, Ge(1)] = 100) -> None:
         self.sweeps = sweeps
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         """Sweep over the generators of CPG; a generator in the cone of the others is dropped."""
         chi, notes = greedy_cone(snapshots, W, stop).generators, list[str]()
         for sweep in range(1, self.sweeps + 1):
@@ -44,4 +44,4 @@ class EnlargedCPG(DualStrategy):
                 break
         else:
             notes.append(f"generators still changed in sweep {self.sweeps}")
-        return Cone(chi, projection_errors(chi, snapshots, W), no_free(chi.shape[1]), tuple(notes))
+        return ReducedSet(chi, projection_errors(chi, snapshots, W), no_free(chi.shape[1]), tuple(notes))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibench import Array, BlockKind, Cone, DualStrategy, InnerProduct, Stop, no_free
+from vibench import Array, BlockKind, DualStrategy, InnerProduct, ReducedSet, Stop, no_free
 from vibench.reduction import REPRODUCED, TIE, hull_distances
 
 
@@ -18,7 +18,7 @@ class HullGreedy(DualStrategy):
     blocks = (BlockKind.INTERVAL,)
     is_default = True
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         """Chosen snapshots of unit norm, and their largest relative distances from the hull."""
         whitened = W.whiten(snapshots)
         norms = np.linalg.norm(whitened, axis=0)
@@ -31,4 +31,4 @@ class HullGreedy(DualStrategy):
             distances[chosen] = 0.0
             errors.append(float(distances.max()) / largest)
         gauges = 1.0 / norms[chosen]
-        return Cone(snapshots[:, chosen] * gauges, np.array(errors), no_free(len(chosen)), gauges=gauges)
+        return ReducedSet(snapshots[:, chosen] * gauges, np.array(errors), no_free(len(chosen)), gauges=gauges)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vibench import Array, Cone, DualStrategy, InnerProduct, Stop
+from vibench import Array, DualStrategy, InnerProduct, ReducedSet, Stop
 from vibench.reduction import GrowingCone, subtract_cone_component
 
 
@@ -11,7 +11,7 @@ class ModifiedCPG(DualStrategy):
 
     is_default = True
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         """Like CPG, but of each new snapshot θ only θ − Υ ≥ 0 becomes a generator, Υ the part already in the cone."""
         cone = GrowingCone(snapshots, W)
         while not cone.reached(stop):

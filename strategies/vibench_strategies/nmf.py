@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge, Lt
 
-from vibench import Array, Cone, DualStrategy, InnerProduct, NumericalError, Stop, foreign, no_free
+from vibench import Array, DualStrategy, InnerProduct, NumericalError, ReducedSet, Stop, foreign, no_free
 from vibench.linalg import singular_values
 from vibench.reduction import refuse_negative
 from vibench_strategies.snapshot_cones import normalised, projection_errors
@@ -33,7 +33,7 @@ class NonnegativeFactors(DualStrategy):
         self.seed, self.iterations = seed, iterations
         self._factorisation, self._not_converged = NMF, ConvergenceWarning
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         """Factorise with one more generator at a time, from the smallest number at which POD meets the tolerance."""
         refuse_negative(snapshots)
         sigma, norms = singular_values(W.whiten(snapshots)), W.norm(snapshots)
@@ -50,9 +50,9 @@ class NonnegativeFactors(DualStrategy):
             f"no factorisation reaches {stop}: the best of up to {most} generators has the error {best:.1e}"
         )
 
-    def _factorised(self, snapshots: Array, W: InnerProduct, size: int) -> Cone:
+    def _factorised(self, snapshots: Array, W: InnerProduct, size: int) -> ReducedSet:
         if not size:
-            return Cone(np.zeros((W.dim, 0)), projection_errors(np.zeros((W.dim, 0)), snapshots, W), no_free(0))
+            return ReducedSet(np.zeros((W.dim, 0)), projection_errors(np.zeros((W.dim, 0)), snapshots, W), no_free(0))
         weights, scale = np.sqrt(W.matrix.diagonal())[:, None], float(snapshots.max())
         method = self._factorisation(size, init="nndsvd", max_iter=self.iterations, random_state=self.seed)
         with warnings.catch_warnings():
@@ -60,4 +60,4 @@ class NonnegativeFactors(DualStrategy):
             generators = normalised(method.fit_transform(weights * (snapshots / scale)) / weights, W)
         stopped = method.n_iter_ >= self.iterations
         notes = (f"the factorisation was stopped after {method.n_iter_} iterations",) if stopped else ()
-        return Cone(generators, projection_errors(generators, snapshots, W), no_free(generators.shape[1]), notes)
+        return ReducedSet(generators, projection_errors(generators, snapshots, W), no_free(generators.shape[1]), notes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, no_free
+from vibench import Array, DualStrategy, InnerProduct, ReducedSet, Stop, no_free
 from vibench.reduction import REPRODUCED, TIE, LazyDistances, refuse_negative
 
 
@@ -15,12 +15,12 @@ class Orthant(DualStrategy):
     domain; here a matching pursuit (Mallat and Zhang 1993) with coefficients α ≥ 0 selects them.
     """
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         """Add the direction most correlated with the residual of the snapshot farthest from the cone."""
         refuse_negative(snapshots)
         units = np.eye(W.dim) / np.sqrt(W.matrix.diagonal())
         if not np.any(snapshots):
-            return Cone(units[:, :0], np.zeros(1), no_free(0))
+            return ReducedSet(units[:, :0], np.zeros(1), no_free(0))
         whitened, chosen = W.whiten(units), list[int]()
         distances = LazyDistances(W.whiten(snapshots))
         farthest, error = distances.next()
@@ -32,4 +32,4 @@ class Orthant(DualStrategy):
             distances.widen(whitened[:, chosen])
             farthest, error = distances.next()
             errors.append(error)
-        return Cone(units[:, chosen], np.array(errors), no_free(len(chosen)))
+        return ReducedSet(units[:, chosen], np.array(errors), no_free(len(chosen)))

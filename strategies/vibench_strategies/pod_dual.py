@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibench import Array, BlockKind, Cone, DualStrategy, InnerProduct, Stop
+from vibench import Array, BlockKind, DualStrategy, InnerProduct, ReducedSet, Stop
 from vibench.linalg import RANK_RTOL, svd
 
 
@@ -19,7 +19,7 @@ class PODDual(DualStrategy):
 
     blocks = (BlockKind.INTERVAL,)
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         """Leading modes, until the largest relative distance of a snapshot from their span is small enough."""
         modes, sigma, right = svd(W.whiten(snapshots))
         rank = int(np.count_nonzero(sigma > RANK_RTOL * np.max(sigma, initial=0.0)))
@@ -29,4 +29,4 @@ class PODDual(DualStrategy):
         errors = distances / (distances[0] or 1.0)
         reached = stop.first_reached(errors)
         size = rank if reached is None else reached
-        return Cone(W.unwhiten(modes[:, :size]), errors[: size + 1], np.ones(size, dtype=bool))
+        return ReducedSet(W.unwhiten(modes[:, :size]), errors[: size + 1], np.ones(size, dtype=bool))

@@ -7,17 +7,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vibench import Array, InnerProduct, NestedStrategy, Step, greedy_cone, project_on_cone, supremizers
-from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
+from vibench.interfaces.strategies import DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, ReducedSet, Stop
 
 
 class Greedy(DualStrategy):
     """The snapshot farthest from the cone, as often as needed."""
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         return greedy_cone(snapshots, W, stop)
 
 
-def _reducing(name: str, change: Callable[[Cone, InnerProduct], Cone]) -> type[Greedy]:
+def _reducing(name: str, change: Callable[[ReducedSet, InnerProduct], ReducedSet]) -> type[Greedy]:
     members = {"reduce": lambda self, snapshots, W, stop: change(greedy_cone(snapshots, W, stop), W)}
     return type(name, (Greedy,), {"__module__": __name__, **members})
 
@@ -27,14 +27,14 @@ def _stopping(name: str, change: Callable[[Stop], Stop]) -> type[Greedy]:
     return type(name, (Greedy,), {"__module__": __name__, **members})
 
 
-def _with_a_negative_entry(cone: Cone, W: InnerProduct) -> Cone:
+def _with_a_negative_entry(cone: ReducedSet, W: InnerProduct) -> ReducedSet:
     """Generators with the last one taken out of them; directions that are no multipliers."""
     chi = cone.generators.copy()
     chi[3, -1] = -0.01
     return replace(cone, generators=chi / W.norm(chi))
 
 
-def _drawn(cone: Cone, W: InnerProduct) -> Cone:
+def _drawn(cone: ReducedSet, W: InnerProduct) -> ReducedSet:
     """Snapshots summed up with weights that are drawn each time."""
     chi = cone.generators * (1.0 + 1e-12 * np.random.default_rng().random((W.dim, 1)))
     return replace(cone, generators=chi / W.norm(chi))
@@ -61,7 +61,7 @@ Oversized = _stopping("Oversized", lambda stop: Stop(size=2) if stop.size == 1 e
 class Normalises(Greedy):
     """Divides the snapshots it is given by their norms."""
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         cone = super().reduce(snapshots.copy(), W, stop)
         norms = W.norm(snapshots)
         snapshots /= np.where(norms > 0.0, norms, 1.0)
@@ -71,13 +71,13 @@ class Normalises(Greedy):
 class DividesByZero(DualStrategy):
     """Every snapshot is a generator, a zero one as well."""
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         count = snapshots.shape[1] if stop.size is None else stop.size
         with np.errstate(invalid="ignore"):
             chi = snapshots[:, :count] / W.norm(snapshots[:, :count])
         distances = [project_on_cone(chi, q, W).distance for q in snapshots.T] if np.all(np.isfinite(chi)) else [0.0]
         error = max(distances) / max(float(W.norm(snapshots).max()), 1e-300)
-        return Cone(chi, np.array([error]), np.zeros(chi.shape[1], dtype=bool))
+        return ReducedSet(chi, np.array([error]), np.zeros(chi.shape[1], dtype=bool))
 
 
 class UnpicklableDual(Greedy):

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vibench import Cone, Kind, Offline, Problem, Reduction, Stop, no_free
+from vibench import Kind, Offline, Problem, ReducedSet, Reduction, Stop, no_free
 from vibench.model.galerkin import ReducedModel
 from vibench.offline.reduction import high_fidelity_sweep
 from vibench.reduction import LazyMaximum
@@ -18,7 +18,7 @@ def offline(problem: Problem, count: int, modes: int, generators: int) -> Offlin
     solved = high_fidelity_sweep(problem, training[:: max(1, len(training) // count)])
     basis = problem.V.orthonormalise(solved.u)[:, :modes]
     chi = solved.lam[:, :generators] / problem.W.norm(solved.lam[:, :generators])
-    cone = Cone(chi, np.ones(1), no_free(generators))
+    cone = ReducedSet(chi, np.ones(1), no_free(generators))
     return Offline(problem, basis, cone, cone_basis(chi, problem.W).span, training)
 
 

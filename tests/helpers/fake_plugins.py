@@ -15,7 +15,7 @@ import scipy.sparse as sp
 from annotated_types import Ge, Le
 
 from vibench import Array, Indices, InnerProduct, ParameterBox, Problem, QPSolution, Sampler, VariationalInequality
-from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
+from vibench.interfaces.strategies import DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, ReducedSet, Stop
 from vibench.qp.solve import solve_qp
 from vibench.reduction.cones import greedy_cone
 
@@ -110,8 +110,8 @@ class BadCone(DualStrategy):
     def __init__(self, how: Literal["negative"]) -> None:
         self.how = how
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        return Cone(-snapshots[:, :2] / W.norm(snapshots[:, :2]), np.ones(1), np.zeros(2, dtype=bool))
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
+        return ReducedSet(-snapshots[:, :2] / W.norm(snapshots[:, :2]), np.ones(1), np.zeros(2, dtype=bool))
 
 
 def _reducing(name: str, act: Callable[[], Any], **members: Any) -> type[DualStrategy]:
@@ -130,7 +130,7 @@ class WaitingCone(DualStrategy):
     def __init__(self, file: str) -> None:
         self.file = Path(file)
 
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         while not self.file.exists():
             time.sleep(0.05)
         return greedy_cone(snapshots, W, stop)

@@ -148,11 +148,11 @@ REDUCE: Acts = {
     "stop": ("ok: ", lambda given: object.__setattr__(given[2], "tolerance", 1.0)),
 }
 CONE: Acts = {
-    "nan": ("error: generators of Cone has an entry that is", changed("generators", lambda chi: chi * np.nan)),
+    "nan": ("error: generators of ReducedSet has an entry that is", changed("generators", lambda chi: chi * np.nan)),
     "short": ("error: `generators` of the cone has shape (11, ", changed("generators", lambda chi: chi[1:])),
     "negative": ("error: a generator has the negative coefficient -", changed("generators", np.negative)),
     "long": ("error: the generators do not all have unit norm in W", changed("generators", lambda chi: 2.0 * chi)),
-    "nothing": ("error: the dual strategy returned a NoneType, expected a Cone", lambda _: None),
+    "nothing": ("error: the dual strategy returned a NoneType, expected a ReducedSet", lambda _: None),
     "buffer": ("ok: ", lambda cone: replace(cone, generators=kept(cone.generators))),
     "forged": ("error: `errors` of the cone has the type", lambda cone: forged(cone, "errors", None)),
     "words": ("error: raised TypeError: 'int'", lambda cone: forged(cone, "fallbacks", 5)),
@@ -226,7 +226,7 @@ class Acting:
 
 
 class HostileCone(Acting, HonestCone):
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: vibench.Stop) -> vibench.Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: vibench.Stop) -> vibench.ReducedSet:
         cone = super().reduce(snapshots, W, stop)
         self.act("reduce", (snapshots, W, stop))
         return self.act("cone", cone, cone)

@@ -6,7 +6,7 @@ import numpy as np
 from fake_plugins import Wire, careful
 
 from vibench import Array, InnerProduct, ParameterBox, Picture, QPSolution, VariationalInequality
-from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
+from vibench.interfaces.strategies import DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, ReducedSet, Stop
 
 LABEL = "=1+1 [/b] [red] $x^{ $ `a` | <img src=x onerror=alert(1)> </script> \x1b[31m\n@ [x](javascript:y)"
 
@@ -37,7 +37,7 @@ class UnreadableError(Exception):
 
 
 class OddCone(DualStrategy):
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         raise OddError
 
 

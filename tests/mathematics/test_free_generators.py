@@ -1,5 +1,6 @@
 """Generators that may be used with either sign, from the cone to the rows of a run."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from numerics import Varying, space
 from samples import SampleStore, carry_out, program_queries
 
-from vibench import Cone, Enrichment, Kind, Status, Stop, VariationalInequality
+from vibench import Enrichment, Kind, ReducedSet, Status, Stop, VariationalInequality
 from vibench.highfidelity import active_set
 from vibench.model.galerkin import ReducedModel
 from vibench.plugins.kinds import PluginKind
@@ -31,12 +32,12 @@ from vibench.study.parameter_sets import ParameterSet
 seeds = st.integers(0, 10_000)
 
 
-def model(free: list[bool]) -> tuple[ReducedModel, Cone]:
+def model(free: list[bool]) -> tuple[ReducedModel, ReducedSet]:
     """A stable reduced model of a small problem with four generators."""
     problem = Varying(count=4)
     solved = [active_set.solve_high_fidelity(problem.assemble(mu)) for mu in problem.training_set()]
     chi = np.column_stack([s.lam for s in solved])
-    cone = Cone(chi / problem.W.norm(chi), np.ones(5), np.array(free))
+    cone = ReducedSet(chi / problem.W.norm(chi), np.ones(5), np.array(free))
     basis = problem.V.orthonormalise(np.column_stack([s.u for s in solved]))
     span = cone_basis(cone.generators, problem.W, cone.free).span
     return ReducedModel(problem, basis, Enrichment(Kind.PER_PARAMETER, eta=span), cone.rays, span), cone
@@ -47,6 +48,9 @@ def test_free_generators_stand_among_the_rays_with_both_signs() -> None:
     assert np.array_equal(cone.rays[:, :4], cone.generators)
     assert np.array_equal(cone.rays[:, 4:], -cone.generators[:, [1, 3]])
     assert cone.size == 4
+    assert [one.kind for one in (cone, model([True] * 4)[1], replace(cone, gauges=np.ones(4)))] == [
+        "cone", "section", "hull",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])

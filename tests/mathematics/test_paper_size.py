@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from vibench import Cone, DualStrategy, HighFidelitySolver, Offline, Stop
+from vibench import DualStrategy, HighFidelitySolver, Offline, ReducedSet, Stop
 from vibench.reduction.cones import orthogonality
 from vibench.reduction.pod import pod
 from vibench.stability.infsup import cone_basis, inf_sup_full, inf_sup_on, nodal_cone
@@ -32,12 +32,12 @@ def training() -> tuple[Obstacle, np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def cone(training) -> Callable[[type[DualStrategy], float], Cone]:
+def cone(training) -> Callable[[type[DualStrategy], float], ReducedSet]:
     """Function that gives the cone of a dual strategy at a tolerance; several tests look at the same one."""
     problem, _, lam = training
 
     @cache
-    def of(strategy: type[DualStrategy], tolerance: float) -> Cone:
+    def of(strategy: type[DualStrategy], tolerance: float) -> ReducedSet:
         found = strategy().reduce(lam, problem.W, Stop(tolerance=tolerance))
         found.generators.setflags(write=False)
         return found

@@ -23,7 +23,7 @@ from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySo
 from vibench.interfaces import validation
 from vibench.interfaces.formulations import FormulationAnswer, Snapshots
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
-from vibench.interfaces.strategies import Cone, Enrichment, Stop
+from vibench.interfaces.strategies import Enrichment, ReducedSet, Stop
 from vibench.linalg.inner_product import InnerProduct, project_out, singular_values
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
 from vibench.model.errors import ReferenceSolutions, errors
@@ -189,7 +189,7 @@ def test_cone(timing: Timing, inputs: StageInputs, dual: str) -> None:
     W, lam, stop = inputs.problem.W, inputs.snapshots.lam, inputs.usual.generators
     strategy = find(PluginKind.DUAL, dual).create({})
 
-    def judge(cone: Cone) -> Info:
+    def judge(cone: ReducedSet) -> Info:
         rays = validation.check_cone(cone, W).rays
         largest = max((project_on_cone(rays, theta, W).distance for theta in lam.T), default=0.0)
         error = largest / (float(W.norm(lam).max(initial=0.0)) or 1.0)

@@ -28,7 +28,7 @@ from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.interfaces.dual_sets import BlockKind
 from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.interfaces.strategies import Cone, Enrichment, PrimalStrategy, Stop
+from vibench.interfaces.strategies import Enrichment, PrimalStrategy, ReducedSet, Stop
 from vibench.signatures import Count, bordered
 from vibench.text import shown
 
@@ -80,7 +80,7 @@ class _Steps(Protocol):
     @property
     def pod(self) -> Any: ...
     @property
-    def cone(self) -> Cone: ...
+    def cone(self) -> ReducedSet: ...
     @property
     def multipliers(self) -> Any: ...
     @property

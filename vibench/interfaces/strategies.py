@@ -58,8 +58,8 @@ class Stop:
 
 @bordered
 @dataclass(frozen=True)
-class Cone:
-    """A reduced multiplier cone K_R = { χ α : α ≥ 0 } (paper, equation (12)).
+class ReducedSet:
+    """A reduced set K_R of multipliers χ α: a cone, α ≥ 0 (paper, equation (12)), a hull, or the section of a span.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Cone:
     errors
         Relative largest projection error e(r) of the cone of the first r generators, r = 0 … R (equations (13), (34)).
     free
-        Which generators may be used with either sign (R,), none in an ordinary cone.
+        Which generators may be used with either sign (R,), none in an ordinary cone, all in a section.
     fallbacks
         One line for every step that deviates from the algorithm.
     gauges
@@ -89,6 +89,11 @@ class Cone:
     def size(self) -> int:
         """Number R of generators."""
         return int(self.generators.shape[1])
+
+    @property
+    def kind(self) -> str:
+        """Whether it is a "cone", a "hull" in K, or the "section" of a linear space with K."""
+        return "hull" if self.gauges is not None else "section" if self.size and self.free.all() else "cone"
 
     @property
     def rays(self) -> Array:
@@ -116,7 +121,7 @@ class DualStrategy(Strategy, ABC):
     """Whether studies that name no dual strategy have this one, where no other default serves K with fewer `blocks`."""
 
     @abstractmethod
-    def reduce(self, snapshots: Annotated[Array, "m", "P"], W: Annotated[InnerProduct, "m"], stop: Stop) -> Cone:
+    def reduce(self, snapshots: Annotated[Array, "m", "P"], W: Annotated[InnerProduct, "m"], stop: Stop) -> ReducedSet:
         """Cone for snapshots λ(mu_p) ∈ K (m×P, rays ≥ 0); `stop` bounds its projection error or size."""
 
 
@@ -150,7 +155,7 @@ class Offline:
 
     problem: Problem
     basis: Annotated[Array, "n", "N"]
-    cone: Cone
+    cone: ReducedSet
     span: Annotated[Array, "m", "rank"]
     training: Annotated[Array, "P", "d"]
 

@@ -20,18 +20,18 @@ from vibench.interfaces.absent_rows import ABSENT, is_absent, settled_bounds
 from vibench.interfaces.dual_sets import RAYS, DualSet
 from vibench.interfaces.outputs import Output, Picture
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
-from vibench.interfaces.strategies import Cone, Enrichment, Sampling, check_sample
+from vibench.interfaces.strategies import Enrichment, ReducedSet, Sampling, check_sample
 from vibench.linalg.inner_product import InnerProduct
 from vibench.signatures import check_attributes, refuse_others, rule_of
 
 
-def check_cone(cone: object, W: InnerProduct, K: DualSet = RAYS) -> Cone:
+def check_cone(cone: object, W: InnerProduct, K: DualSet = RAYS) -> ReducedSet:
     """A copy of a cone; refused if generators are not finite, of the right shape, of unit norm in W, or in W⁺ or free.
 
     Rows of K that are no rays may have any sign.
     """
-    if not isinstance(cone, Cone):
-        raise NumericalError(f"the dual strategy returned a {type(cone).__name__}, expected a Cone")
+    if not isinstance(cone, ReducedSet):
+        raise NumericalError(f"the dual strategy returned a {type(cone).__name__}, expected a ReducedSet")
     chi = taken(cone.generators, "`generators` of the cone", W.dim, "count")
     errors, R = taken(cone.errors, "`errors` of the cone", "count"), chi.shape[1]
     if len(errors) not in (1, R + 1) or errors.min() < 0.0:
@@ -52,7 +52,7 @@ def check_cone(cone: object, W: InnerProduct, K: DualSet = RAYS) -> Cone:
     gauges = None if cone.gauges is None else taken(cone.gauges, "`gauges` of the cone", R)
     if gauges is not None and (gauges.min(initial=1.0) <= 0.0 or cone.free.any()):
         raise NumericalError("`gauges` of the cone are not positive, or it has free generators, which no hull has")
-    return Cone(chi, errors, cone.free.copy(), tuple(map(str, cone.fallbacks)), gauges)
+    return ReducedSet(chi, errors, cone.free.copy(), tuple(map(str, cone.fallbacks)), gauges)
 
 
 def check_enrichment(

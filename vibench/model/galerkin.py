@@ -64,8 +64,8 @@ class ReducedModel:
 
     `basis` is a V-orthonormal one of V_N (n×N), `fixed_basis` the part of the primal basis that does not depend on the
     parameter (n×(N+S)). `generators` are χ (m×R), unit norm in W, all with nonnegative coefficients: a free generator
-    appears with both signs (`Cone.rays`), and its two inequalities are an equality. `span` is a W-orthonormal basis of
-    span χ (m×rank), from which per-parameter enrichments are computed.
+    appears with both signs (`ReducedSet.rays`), and its two inequalities are an equality. `span` is a W-orthonormal
+    basis of span χ (m×rank), from which per-parameter enrichments are computed.
     """
 
     def __init__(self, problem: Problem, basis: Array, enrichment: Enrichment, generators: Array, span: Array) -> None:

@@ -16,7 +16,7 @@ from vibench.interfaces import strategies, validation
 from vibench.interfaces.dual_sets import refuse_blocks
 from vibench.interfaces.formulations import Formulation, FormulationModel, QuerySettings, Snapshots, axes_of
 from vibench.interfaces.problem import Problem
-from vibench.interfaces.strategies import AdaptiveSampling, Cone, DualStrategy, PrimalStrategy, Sampling, Stop
+from vibench.interfaces.strategies import AdaptiveSampling, DualStrategy, PrimalStrategy, ReducedSet, Sampling, Stop
 from vibench.linalg.inner_product import check_symmetric
 from vibench.model import hyperreduced
 from vibench.model.affine import INTERPOLATION_RTOL, AffineMember, affine_decomposition
@@ -182,11 +182,11 @@ class Reduction:
         return pod(self.snapshots.u, self.problem.V, self.modes)
 
     @cached_property
-    def cone(self) -> Cone:
+    def cone(self) -> ReducedSet:
         """The reduced cone K_R (paper, (12))."""
         W, K = self.problem.W, self.problem.K
         if self.dual is None or self.generators is None:
-            return Cone(np.zeros((W.dim, 0)), np.ones(1), strategies.no_free(0))
+            return ReducedSet(np.zeros((W.dim, 0)), np.ones(1), strategies.no_free(0))
         refuse_blocks(K, self.dual.blocks, type(self.dual).__qualname__)
         return validation.check_cone(self.dual.reduce(self.snapshots.lam, W, self.generators), W, K)
 

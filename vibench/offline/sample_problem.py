@@ -12,7 +12,7 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.interfaces.formulations import Snapshots
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Problem, Sampler, VariationalInequality
-from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
+from vibench.interfaces.strategies import DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, ReducedSet, Stop
 from vibench.linalg.inner_product import InnerProduct
 from vibench.offline.reduction import Reduction, high_fidelity_sweep
 from vibench.reduction.cones import greedy_cone
@@ -63,7 +63,7 @@ def _tridiagonal(off: float, diagonal: float, n: int) -> SparseMatrix:
 
 
 class _Greedy(DualStrategy):
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> ReducedSet:
         return greedy_cone(snapshots, W, stop)
 
 

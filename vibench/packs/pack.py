@@ -17,7 +17,7 @@ from vibench.interfaces.dual_sets import RAYS, DualSet, refuse_blocks
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
-from vibench.interfaces.strategies import Cone, DualStrategy, Stop
+from vibench.interfaces.strategies import DualStrategy, ReducedSet, Stop
 from vibench.interfaces.validation import check_cone
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import decomposed, held_out_error
@@ -247,7 +247,7 @@ def pack_multipliers(pack: ModelPack) -> tuple[Array, Array]:
     return lam[:, training], lam[:, ~training]
 
 
-def reduce_multipliers(pack: ModelPack, strategy: DualStrategy, tolerance: float) -> tuple[Cone, float | None]:
+def reduce_multipliers(pack: ModelPack, strategy: DualStrategy, tolerance: float) -> tuple[ReducedSet, float | None]:
     """A cone of the multipliers at training parameters, and its largest error at others by the largest norm."""
     training, others = pack_multipliers(pack)
     refuse_blocks(pack.K, strategy.blocks, f"the dual strategy {type(strategy).__name__}")

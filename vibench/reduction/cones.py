@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 
 from vibench.arrays import Array, Indices, Mask
 from vibench.errors import NumericalError
-from vibench.interfaces.strategies import Cone, Stop, no_free, rays
+from vibench.interfaces.strategies import ReducedSet, Stop, no_free, rays
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
 from vibench.signatures import constructed
@@ -182,12 +182,14 @@ class GrowingCone:
         self._errors.append(self.error)
         return True
 
-    def result(self) -> Cone:
+    def result(self) -> ReducedSet:
         """The cone, with its error for every number of generators."""
-        return Cone(self.generators, np.array(self._errors), no_free(len(self._errors) - 1), tuple(self._fallbacks))
+        return ReducedSet(
+            self.generators, np.array(self._errors), no_free(len(self._errors) - 1), tuple(self._fallbacks)
+        )
 
 
-def greedy_cone(snapshots: Annotated[Array, "m", "P"], W: Annotated[InnerProduct, "m"], stop: Stop) -> Cone:
+def greedy_cone(snapshots: Annotated[Array, "m", "P"], W: Annotated[InnerProduct, "m"], stop: Stop) -> ReducedSet:
     """Cone of snapshots (m×Q) chosen greedily (paper, Remark 4.3, and Benaceur, Ern and Ehrlacher 2020).
 
     Each step adds the snapshot farthest from the present cone, normalised. It ends before `stop` where all snapshots

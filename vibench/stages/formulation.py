@@ -9,7 +9,7 @@ from typing import Any, cast
 
 from vibench.arrays import Array
 from vibench.interfaces.formulations import Formulation, Snapshots
-from vibench.interfaces.strategies import Cone, Enrichment, Kind
+from vibench.interfaces.strategies import Enrichment, Kind, ReducedSet
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.inner_product import InnerProduct
@@ -41,7 +41,7 @@ storable(
     AffineMember, Evaluation, ReducedOperators, ProjectedMember, ContactCoordinates, LoadCoordinates,
     SpannedCoordinates, InnerProduct, SparseCholesky, PartialCholesky, BlockDiagonal,
     # Formulations may build steps of other offline phases, and compiled programs.
-    POD, Cone, Kind, Enrichment, CompiledModel, AffinePolynomial,
+    POD, ReducedSet, Kind, Enrichment, CompiledModel, AffinePolynomial,
     CertificateBase, Constant, ContactCompliance, OnlineInfSup, PreparedCorrections, ResidualBasis, SpectralBounds,
     AnchorGrid, TermRanges,
 )  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from vibench.interfaces.dual_sets import refuse_blocks
-from vibench.interfaces.strategies import Cone, Stop
+from vibench.interfaces.strategies import ReducedSet, Stop
 from vibench.interfaces.validation import check_cone
 from vibench.plugins.plugin import Plugin
 from vibench.reduction.cones import orthogonality
@@ -20,7 +20,7 @@ from vibench.study.cells import Axes
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.timing import timed
 
-storable(POD, Cone, ConeBasis, ConstraintClasses)
+storable(POD, ReducedSet, ConeBasis, ConstraintClasses)
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class PODStage(Stage):
 class ReducedCone:
     """A cone, and its multipliers prepared for constants and enrichments."""
 
-    cone: Cone
+    cone: ReducedSet
     prepared: ConeBasis
 
 

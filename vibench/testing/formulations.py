@@ -14,7 +14,7 @@ import vibench.stages.formulation  # noqa: F401  lists the classes that formulat
 from vibench.arrays import Array, read_only
 from vibench.errors import NumericalError, UnsupportedError, VibenchError, placed
 from vibench.interfaces.formulations import Formulation, FormulationAnswer, OfflinePhase, Outcome, axes_of
-from vibench.interfaces.strategies import Cone, no_free
+from vibench.interfaces.strategies import ReducedSet, no_free
 from vibench.model.errors import residual_multiplier
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import ACCURACY, CellSolver, Model, check_built
@@ -203,7 +203,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         """Snapshots without contact are accepted, or refused in one line."""
         offline, m = self.phase(self.plugin), self.whole.problem.W.dim
         none = replace(offline.snapshots, lam=np.zeros_like(offline.snapshots.lam))
-        empty = {"cone": Cone(np.zeros((m, 0)), np.zeros(1), no_free(0))} if offline.dual is not None else {}
+        empty = {"cone": ReducedSet(np.zeros((m, 0)), np.zeros(1), no_free(0))} if offline.dual is not None else {}
         steps = {"snapshots": none} | ({"pod": self.whole.pod} if offline.modes is not None else {}) | empty
         mu = next(iter(self.arguments.values()))
         try:

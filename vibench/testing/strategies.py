@@ -15,11 +15,11 @@ from vibench.errors import NumericalError, RequestError, VibenchError, placed
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.strategies import (
     AdaptiveSampling,
-    Cone,
     DualStrategy,
     Enrichment,
     Offline,
     PrimalStrategy,
+    ReducedSet,
     Sampling,
     Stop,
     Trainer,
@@ -39,7 +39,7 @@ from vibench.testing.checks import Check, ConformanceError, Doubt, Note, raised
 
 
 @dataclass(eq=False)
-class DualCase(Case[DualStrategy, Stop, Cone]):
+class DualCase(Case[DualStrategy, Stop, ReducedSet]):
     """A dual strategy, tolerances and sizes, and the cones it makes of snapshots (m×P)."""
 
     base = DualStrategy
@@ -61,11 +61,13 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
         stops = {f"tolerance {value}": Stop(tolerance=value) for value in self.tolerances}
         return stops | {f"size {value}": Stop(size=value) for value in self.sizes}
 
-    def evaluate(self, argument: Stop, plugin: DualStrategy | None = None, snapshots: Array | None = None) -> Cone:
+    def evaluate(
+        self, argument: Stop, plugin: DualStrategy | None = None, snapshots: Array | None = None
+    ) -> ReducedSet:
         given = read_only(self.lam if snapshots is None else snapshots)
         return self.clocked("a cone", lambda: (plugin or self.plugin).reduce(given, self.space, argument))
 
-    def arrays(self, result: Cone) -> Arrays:
+    def arrays(self, result: ReducedSet) -> Arrays:
         return {"generators": result.generators, "errors": result.errors, "free": result.free.astype(float)}
 
     def cone(self) -> Iterator[str]:
@@ -81,7 +83,7 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
             if stop.tolerance is not None:
                 yield from self._missed(stop.tolerance, self.results[name], self.lam)
 
-    def _missed(self, tolerance: float, cone: Cone, snapshots: Array) -> Iterator[str]:
+    def _missed(self, tolerance: float, cone: ReducedSet, snapshots: Array) -> Iterator[str]:
         errors = self._errors(cone, cone.size, snapshots)
         if errors.max(initial=0.0) > tolerance + _round_off(tolerance):
             missed = f"tolerance {tolerance:g} is missed by {cone.size} generators, which claim {cone.errors[-1]:.3g}"
@@ -126,7 +128,7 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
         with placed("with zero snapshots alone", NumericalError):
             check_cone(cone, self.space)
 
-    def _errors(self, cone: Cone, r: int, snapshots: Array) -> Array:
+    def _errors(self, cone: ReducedSet, r: int, snapshots: Array) -> Array:
         """Projection errors (P,) on the cone of the first r generators, relative to the largest norm of a snapshot."""
         largest = float(np.max(self.space.norm(snapshots), initial=0.0)) or 1.0
         chi = rays(cone.generators[:, :r], cone.free[:r])
@@ -252,7 +254,7 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
     def without_contact(self) -> None:
         """A cone without generators, as of snapshots without contact, is accepted or refused."""
         none = np.zeros((self.model.problem.W.dim, 0))
-        offline = replace(self.model, cone=Cone(none, np.zeros(1), no_free(0)), span=none)
+        offline = replace(self.model, cone=ReducedSet(none, np.zeros(1), no_free(0)), span=none)
         try:
             built = self.plugin.build(offline, next(iter(self.arguments.values())))
         except VibenchError:  # a strategy may refuse it in one line

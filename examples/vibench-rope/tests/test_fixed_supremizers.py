@@ -11,10 +11,10 @@ import scipy.sparse as sp
 
 from vibench import (
     Array,
-    Cone,
     Enrichment,
     Offline,
     Problem,
+    ReducedSet,
     VariationalInequality,
     check_enrichment,
     no_free,
@@ -41,7 +41,7 @@ def offline(problem: Problem) -> Offline:
     basis = problem.V.orthonormalise(rng.standard_normal((problem.V.dim, 2)))
     chi = rng.random((problem.W.dim, 3))
     chi /= problem.W.norm(chi)
-    cone = Cone(chi, np.zeros(4), no_free(3))
+    cone = ReducedSet(chi, np.zeros(4), no_free(3))
     return Offline(problem, basis, cone, problem.W.orthonormalise(chi), problem.parameters.grid(3, 3))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from vibench import Array, Cone, Problem, Reduction, Stop, create
+from vibench import Array, Problem, ReducedSet, Reduction, Stop, create
 from vibench.report import ProblemTables
 from vibench_problems.paper.published import PROBLEMS, Pair, Published
 
@@ -148,7 +148,7 @@ def reduction_of(problem: Problem) -> Reduction:
     return Reduction(problem, create("dual strategy", MODIFIED), None, Stop(tolerance=0.0), Stop(tolerance=0.0))
 
 
-def stopped(reduction: Reduction, stop: Stop, dual: str = MODIFIED) -> Cone:
+def stopped(reduction: Reduction, stop: Stop, dual: str = MODIFIED) -> ReducedSet:
     """The cone of the same snapshots with another end, or of another dual strategy."""
     other = replace(reduction, generators=stop, dual=create("dual strategy", dual))
     return other.given(snapshots=reduction.snapshots).cone

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pandas as pd
 
-from vibench import Array, Cone, Problem, Reduction, Stop, project_on_cone
+from vibench import Array, Problem, ReducedSet, Reduction, Stop, project_on_cone
 from vibench_problems.paper.claims import Claim, below, holds, number, span, text, unknown
 from vibench_problems.paper.constants import HF
 from vibench_problems.paper.evidence import MODIFIED, PLAIN, Evidence, last, stopped
@@ -82,7 +82,7 @@ def _pga(evidence: Evidence, pair: Pair, *, loose: bool = False) -> pd.Series:
     return evidence.cell(pair, "fixed", pair.loose if loose else evidence.paper.tight)
 
 
-def supremizer_dimension(reduction: Reduction, cone: Cone) -> int:
+def supremizer_dimension(reduction: Reduction, cone: ReducedSet) -> int:
     """Dimension of the sum of the spaces S_R(µ) over the training set, equation (20)."""
     problem, chi = reduction.problem, cone.generators
     loads = np.hstack([np.asarray(problem.constraint(mu)[0].T @ chi) for mu in reduction.snapshots.mu])

@@ -11,13 +11,13 @@ from scipy.linalg import solve_triangular
 from vibench import (
     Array,
     BlockKind,
-    Cone,
     DualSet,
     Formulation,
     FormulationAnswer,
     FormulationModel,
     Outcome,
     QuerySettings,
+    ReducedSet,
     UnsupportedError,
     VariationalInequality,
 )
@@ -206,14 +206,14 @@ def is_met(program: VariationalInequality, found: Any, accuracy: float) -> bool:
     )
 
 
-def gauges_of(cone: Cone, K: DualSet) -> Array:
+def gauges_of(cone: ReducedSet, K: DualSet) -> Array:
     """The γ (R,) of a hull, zeros for a cone; an `UnsupportedError` if a cone leaves K."""
-    if cone.gauges is None and K.blocks:
+    if cone.kind == "cone" and K.blocks:
         raise UnsupportedError("a cone leaves a bounded K: choose a dual strategy of hulls or linear spaces")
     return np.zeros(cone.size) if cone.gauges is None else np.asarray(cone.gauges)
 
 
-def section_rows(cone: Cone, K: DualSet) -> tuple[Array, Array]:
+def section_rows(cone: ReducedSet, K: DualSet) -> tuple[Array, Array]:
     """Rows (k×R) and bounds (k,) of the section { α : χα ∈ K }, of generators that are all free in sign."""
     if not cone.free.all():
         raise UnsupportedError("the cone has generators with and without a sign: no section of K, and no hull in it")

@@ -10,13 +10,13 @@ import numpy as np
 
 from vibench import (
     Array,
-    Cone,
     Formulation,
     FormulationAnswer,
     FormulationModel,
     Kind,
     Outcome,
     QuerySettings,
+    ReducedSet,
     UnsupportedError,
     VariationalInequality,
 )
@@ -106,7 +106,7 @@ class FixedSpacesModel(FormulationModel):
         return self._vectors @ answer.x, self._chi @ answer.alpha
 
 
-def refuse_free(cone: Cone) -> None:
+def refuse_free(cone: ReducedSet) -> None:
     """Raise an `UnsupportedError` if generators may be used with either sign."""
     if cone.free.any():
         raise UnsupportedError("the formulation needs λ ≥ 0, and the cone has generators that are free in sign")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numerics import space
 
 from vibench import Array, InnerProduct, NumericalError, QPSolution, VariationalInequality, check_cone
-from vibench.interfaces.strategies import Cone, DualStrategy, Stop, rays
+from vibench.interfaces.strategies import DualStrategy, ReducedSet, Stop, rays
 from vibench.reduction import cone_subtraction, subtract_cone_component
 from vibench.reduction.cones import project_on_cone
 from vibench_strategies import enlarged_cpg
@@ -63,7 +63,7 @@ ALL = pytest.mark.parametrize("create", STRATEGIES)
 EUCLID = InnerProduct(sp.eye_array(3))
 
 
-def errors_one_by_one(cone: Cone, theta: Array, X: InnerProduct) -> Array:
+def errors_one_by_one(cone: ReducedSet, theta: Array, X: InnerProduct) -> Array:
     """e(r) for r = 0 … R, every snapshot projected on every cone."""
     largest = float(X.norm(theta).max(initial=0.0)) or 1.0
     cones = [rays(cone.generators[:, :r], cone.free[:r]) for r in range(cone.size + 1)]
@@ -208,7 +208,9 @@ def test_a_generator_that_the_others_contain_is_dropped(monkeypatch: pytest.Monk
     """CPG itself chooses none; a greedy algorithm that knew the others only later would."""
     a, b, c = np.eye(12)[:, 0], np.eye(12)[:, 4], np.eye(12)[:, 8]
     chi = np.column_stack([a, a + b, b, c])
-    monkeypatch.setattr(enlarged_cpg, "greedy_cone", lambda *_: Cone(chi / W.norm(chi), np.ones(5), np.zeros(4, bool)))
+    monkeypatch.setattr(
+        enlarged_cpg, "greedy_cone", lambda *_: ReducedSet(chi / W.norm(chi), np.ones(5), np.zeros(4, bool))
+    )
     cone = EnlargedCPG().reduce(chi, W, Stop(size=4))
     assert cone.size == 3
     assert cone.errors[-1] < 1e-9

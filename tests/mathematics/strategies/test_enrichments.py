@@ -12,7 +12,17 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numerics import Varying
 
-from vibench import Array, Cone, HighFidelitySolver, Kind, NumericalError, Offline, Stop, check_enrichment, no_free
+from vibench import (
+    Array,
+    HighFidelitySolver,
+    Kind,
+    NumericalError,
+    Offline,
+    ReducedSet,
+    Stop,
+    check_enrichment,
+    no_free,
+)
 from vibench.errors import RequestError
 from vibench.linalg.inner_product import orthonormal_range, project_out, singular_values
 from vibench.reduction.cones import LazyMaximum
@@ -293,7 +303,7 @@ def test_they_conform_and_add_nothing_without_generators(varying: Offline) -> No
     """Also with options: the registered ones are checked as all plugins are."""
     check(partial(OfflinePGA, stop="beta"))
     empty = np.zeros((varying.problem.W.dim, 0))
-    data = Offline(varying.problem, varying.basis, Cone(empty, np.zeros(1), no_free(0)), empty, varying.training)
+    data = Offline(varying.problem, varying.basis, ReducedSet(empty, np.zeros(1), no_free(0)), empty, varying.training)
     for strategy in (InfSupGreedy(), OfflinePGA(stop="beta"), OfflinePGA(), PODSupremizers()):
         assert strategy.build(data, 0.5).vectors.shape == (varying.problem.V.dim, 0)
     assert Decorrelated().build(varying, None).kind is Kind.NONE

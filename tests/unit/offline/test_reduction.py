@@ -58,7 +58,7 @@ def test_steps_are_computed_once_when_asked_for_and_follow_given_ones(
     calls: list[str] = []
 
     class Counting(vibench.DualStrategy):
-        def reduce(self, snapshots: np.ndarray, W: vibench.InnerProduct, stop: vibench.Stop) -> vibench.Cone:
+        def reduce(self, snapshots: np.ndarray, W: vibench.InnerProduct, stop: vibench.Stop) -> vibench.ReducedSet:
             calls.append("cone")
             return vibench.greedy_cone(snapshots, W, stop)
 

@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 from vibench.arrays import Array
 from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.problem import ContactLoads
-from vibench.interfaces.strategies import Cone, Offline, Stop, no_free
+from vibench.interfaces.strategies import Offline, ReducedSet, Stop, no_free
 from vibench.reduction import Cubature, cubature
 from vibench.reduction.nested import NestedStrategy, Step, grow_through
 from vibench.reduction.pod import pod
@@ -179,7 +179,7 @@ class UnitVectors(NestedStrategy):
 @pytest.fixture
 def offline() -> Offline:
     problem = Wire()
-    cone = Cone(np.zeros((problem.W.dim, 0)), np.ones(1), no_free(0))
+    cone = ReducedSet(np.zeros((problem.W.dim, 0)), np.ones(1), no_free(0))
     return Offline(problem, np.zeros((problem.V.dim, 0)), cone, cone.generators, problem.training_set())
 
 

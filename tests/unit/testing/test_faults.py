@@ -69,7 +69,7 @@ FAULTS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "Oversized": ("size", "size 1 was prescribed; the cone has 2 generators"),
         "Draws": ("determinism", "size 3: a second call gives different values of generators: entry ("),
         "Normalises": ("cone", "ValueError: output array is read-only (broken_strategies.py, line", "snapshots /= "),
-        "DividesByZero": ("snapshots without contact", "generators of Cone has an entry that is not finite"),
+        "DividesByZero": ("snapshots without contact", "generators of ReducedSet has an entry that is not finite"),
         "UnpicklableDual": ("pickling", "cannot be pickled", "attribute weight"),
         "NotOrthogonal": ("enrichment", "not orthonormal in V and orthogonal to V_N: the ", " of vector "),
         "AsksForATolerance": ("tolerance", "without a tolerance", "TypeError", "set takes_tolerance = True"),
