@@ -121,11 +121,14 @@ def help_on(
     from vibench.cli.console import shown
     from vibench.text import new_console
 
-    known = commands
+    known, plural = commands, list[str]()
     lines = [f"`vibench {word}` is now `vibench {shlex.join(new)}`"] if (new := renamed([word])) else []
     for names, line in explained_words():
         known += names
-        lines += [line] * (word.casefold() in map(str.casefold, names))
+        folded = [*map(str.casefold, names)]
+        lines += [line] * (word.casefold() in folded)
+        plural += [line] * (f"{word.casefold()}s" in folded)
+    lines = lines or plural
     if not lines:
         raise unknown_name("command, key, column, status, plugin or term", word, set(known))
     for line in lines:

@@ -35,14 +35,21 @@ def run_study_command(
     problem: Annotated[
         Names, Option(help="The problem: NAME, FILE.py:CLASS, or a pack (repeatable).", autocompletion=problems)
     ] = None,
-    formulation: Annotated[Names, Option(help="Replace the formulations.", autocompletion=formulations)] = None,
-    dual: Annotated[Names, Option(help="Replace the dual strategies.", autocompletion=duals)] = None,
-    primal: Annotated[Names, Option(help="Replace the primal strategies.", autocompletion=primals)] = None,
+    formulation: Annotated[
+        Names, Option(help="Replace the formulations: NAME or FILE.py:CLASS.", autocompletion=formulations)
+    ] = None,
+    dual: Annotated[
+        Names, Option(help="Replace the dual strategies: NAME or FILE.py:CLASS.", autocompletion=duals)
+    ] = None,
+    primal: Annotated[
+        Names, Option(help="Replace the primal strategies: NAME or FILE.py:CLASS.", autocompletion=primals)
+    ] = None,
     solver: Annotated[Names, Option(help="Replace the QP solvers.", autocompletion=solvers)] = None,
     correction: Annotated[Names, Option(help="Replace the corrections.", autocompletion=corrections)] = None,
     pod_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the POD.")] = None,
     dual_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the dual strategies.")] = None,
     primal_tol: Annotated[Tolerances, Option(help="Replace the tolerances of the primal strategies.")] = None,
+    validation: Annotated[int | None, Option(min=1, metavar="N", help="Number of validation parameters.")] = None,
     at: At = None,
     out: Annotated[Path | None, Option(help="Results folder; runs/STUDY by default.")] = None,
     jobs: Annotated[int | None, Option("--jobs", "-j", min=0, help="Worker processes; default: one per core.")] = None,
@@ -63,9 +70,12 @@ def run_study_command(
         from vibench.study.matrix import expand
 
         overrides = {
-            "problem": [problem_entry(one) for one in problem or ()], "formulation": formulation, "dual": dual,
-            "primal": primal, "solvers": solver, "correction": correction, "pod": pod_tol, "dual_tol": dual_tol,
-            "primal_tol": primal_tol,
+            "problem": [problem_entry(one) for one in problem or ()],
+            "formulation": [plugin_entry(one, "formulation") for one in formulation or ()],
+            "dual": [plugin_entry(one, "dual strategy") for one in dual or ()],
+            "primal": [plugin_entry(one, "primal strategy") for one in primal or ()],
+            "solvers": solver, "correction": correction, "pod": pod_tol, "dual_tol": dual_tol,
+            "primal_tol": primal_tol, "validation": validation and [validation],
         }  # fmt: skip
         usual = study is None and problem is not None
         loaded = _study(
@@ -133,20 +143,25 @@ def _conclude(outcome: RunResult, folder: Path, *, draw: bool, fresh: bool, stri
 
 def problem_entry(text: str) -> Any:
     """A problem of the command line: its name, the class of a Python file, or the entry of a pack's folder."""
-    import runpy
-
     from vibench.packs.manifest import FILE
 
     # Methods of Path raise an OSError if a name is too long for a file.
     if os.path.isfile(os.path.join(text, FILE)):  # noqa: PTH113, PTH118
         return {"name": "pack", "label": Path(text).absolute().name, "options": {"path": str(Path(text).absolute())}}
+    return plugin_entry(text, "problem")
+
+
+def plugin_entry(text: str, noun: str) -> Any:
+    """A plugin of the command line: its name, or the class of a Python file."""
+    import runpy
+
     file, _, name = text.rpartition(":")
     if not file.endswith(".py"):
         return text
     try:
         contents = runpy.run_path(file)
     except (Exception, SystemExit) as error:  # noqa: BLE001  the file may raise anything
-        raise RequestError(f"the problem '{text}': {file} cannot be run: {in_a_line(error)}") from None
+        raise RequestError(f"the {noun} '{text}': {file} cannot be run: {in_a_line(error)}") from None
     if not isinstance(contents.get(name), type):
         classes = [one for one, value in contents.items() if isinstance(value, type)]
         raise unknown_name(f"class of {file}", name, classes)

@@ -88,7 +88,9 @@ class Member(_Table):
 class Spaces(_Table):
     """The inner products, and what belongs to the unknowns and the multipliers."""
 
-    X_V: Annotated[str | None, Field(description="Gram matrix of the primal space (n×n).")] = None
+    X_V: Annotated[str | None, Field(description="Gram matrix of the primal space (n×n), required with operators.")] = (
+        None
+    )
     X_W: Annotated[str, Field(description="Gram matrix of the multiplier space (m×m).")]
     free: Annotated[str | None, Field(description="Indices of the free unknowns, if arrays have others, too.")] = None
     contact: Annotated[str | None, Field(description="Indices of the unknowns B touches; by default found.")] = None
@@ -231,4 +233,5 @@ def _check_parameters(given: Parameters) -> None:
             raise RequestError(f"parameters: the lower bound {low:g} of '{name}' is above its upper bound {high:g}")
     # Neither has points from which a box could be taken.
     if given.lower is None and (given.training.grid is not None or given.validation is None):
-        raise RequestError("parameters: a grid, or a random validation set, needs the box: give 'lower' and 'upper'")
+        remedy = "'lower' and 'upper'" + " or 'validation'" * (given.training.grid is None)
+        raise RequestError(f"parameters: a grid, or a random validation set, needs the box: give {remedy}")

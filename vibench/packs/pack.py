@@ -230,7 +230,8 @@ class ModelPack:
             return self.box.sample(count, seed)
         if count > len(self.validation):
             most, asked = len(self.validation), f"the study asks for {count}"
-            raise NumericalError(f"the pack lists {most} validation parameters, {asked}: set validation = {most}")
+            remedy = f"set validation = {most} in its file, or run it with --validation {most}"
+            raise NumericalError(f"the pack lists {most} validation parameters, {asked}: {remedy}")
         return self.validation[:count]
 
 

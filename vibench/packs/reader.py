@@ -88,7 +88,7 @@ class PackReader:
             raise RequestError("without the table [operators] a pack consists of [spaces] X_W and [solutions] lam")
         # The dual half of a pack needs X_W alone.
         if operators is not None and spaces.X_V is None:
-            raise RequestError("spaces.X_V: required with [operators], but not given")
+            raise RequestError("spaces.X_V: required with [operators], but not given; A at one parameter is a choice")
         training, validation, box = self._domain(given)
         W = self._inner_product(self._files.sparse(spaces.X_W, "spaces.X_W"), "X_W")
         V = None if operators is None or spaces.X_V is None else self._primal_space(spaces.X_V)

@@ -39,11 +39,12 @@ class Verdict:
         limit = f"{100.0 * self.error:g} %"
         full = f"{self.problem}: a full solution takes {_time(self.full_s)}"
         if self.best is None:
-            return f"{full}. No model of this run takes part in a comparison; `vibench show` gives the reasons."
+            return f"{full}. No model of this run takes part in a comparison; `vibench show RUN --table best` says why."
         errors = f"{_percent(self.best['error_u_mean'])} for u and {_percent(self.best['error_lambda_mean'])} for λ"
         if not self.within:
             closest = f"No model is within {limit} for both u and λ; the closest is {self.model}, with {errors}"
-            return f"{full}. {closest}. Smaller tolerances or more training would help."
+            remedy = "More training parameters, or smaller tolerances of POD and cone, may help"
+            return f"{full}. {closest}. {self._payment}. {remedy}."
         cost = f"a query of the best model within {limit} takes {_time(self.best['online_s'])}"
         certified = {"certified": "with proved error bounds", "verified": "with error bounds verified at samples"}
         proof = certified.get(str(self.best["certificate"]), "without error bounds")

@@ -48,8 +48,8 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
         Path of a TOML file, or the name of a registered study.
     overrides
         Values that replace those of the file: of the axes "problem", "formulation", "dual", "primal", "solvers" and
-        "correction", and of the tolerances "pod", "dual_tol" and "primal_tol" in every table. Empty sequences replace
-        nothing.
+        "correction", of "validation", and of the tolerances "pod", "dual_tol" and "primal_tol" in every table. Empty
+        sequences replace nothing.
 
     Raises
     ------
@@ -109,6 +109,8 @@ def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> di
             content[axis] = [entry for name in given[axis] for entry in _entries_in(content.get(axis), name)]
     if "correction" in given:
         content["correction"] = given["correction"]
+    if "validation" in given:
+        (content["validation"],) = given["validation"]
     tables = content.get("tolerances")
     if isinstance(tables, list) and all(isinstance(table, dict) for table in tables):
         primal = content.get("primal")

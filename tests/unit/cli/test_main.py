@@ -138,6 +138,16 @@ def test_a_problem_alone_is_run_with_the_usual_choices(main: Main, tmp_path: Pat
         refused(main("run", "--problem", problem, "--dry-run"), said)
 
 
+def test_a_strategy_in_a_file_is_a_row_of_a_run(main: Main, tmp_path: Path) -> None:
+    (tmp_path / "cone.py").write_text(
+        "from vibench_strategies.mcpg import ModifiedCPG\n\nclass Mine(ModifiedCPG):\n    pass\n"
+    )
+    duals = ["--dual", "mcpg", "--dual", f"{tmp_path}/cone.py:Mine"]
+    out = succeeded(main("run", "--problem", "obstacle", *duals, "--dry-run"))
+    assert (out.count("obstacle · mcpg · "), out.count("obstacle · Mine · ")) == (8, 8)
+    refused(main("run", "--dual", f"{tmp_path}/cone.py:Mien", "--dry-run"), "did you mean 'Mine'")
+
+
 def test_dry_runs_list_the_matrix_and_lists_their_plugins(main: Main, tmp_path: Path) -> None:
     labelled = write_study(tmp_path, changed(STUDY, "problem", 0, "label", to="a\n0 cells\x1b[2J"))
     for study, words in (("quick", ""), (labelled, r"a\n0 cells\u001b[2J · ")):
@@ -248,9 +258,9 @@ def test_help_is_there_for_every_word_and_former_commands_still_work(main: Main,
     known = "no command, key, column, status, plugin or term is called 'shwo'; did you mean 'show'?"
     refused(main("help", "shwo"), known)
     said = {
-        "supremizer": "Supremizer: T(µ)η, the displacement", "as fast": "Break-even: ", "feasible": "Correction: ",
-        "certified": "Certificate: certified, v", "κ": "ρ, ω, κ: residual", "mcpg": "mcpg, a dual strategy of vibench",
-        "piqp": "piqp, a QP solver", "quick": "quick, a study of vibench",
+        "supremizer": "Supremizer: T(µ)η, the displacement", "as fast": "Break-even: ", "tolerance": "tolerances, in ",
+        "feasible": "Correction: ", "certified": "Certificate: certified, v", "κ": "ρ, ω, κ: residual",
+        "mcpg": "mcpg, a dual strategy of vibench", "piqp": "piqp, a QP solver", "quick": "quick, a study of vibench",
         "best": "best, a table of a run: `vibench show RUN --table best`",
         "diff": "`vibench diff` is now `vibench compare --table changes --strict`",
     }  # fmt: skip

@@ -342,3 +342,4 @@ def test_more_validation_parameters_than_are_listed_are_refused_before_a_run(tmp
     study = write_study(tmp_path, study_on(write_cable(tmp_path / "pack"), 3))
     with pytest.raises(RequestError, match="lists 2 validation parameters, the study asks for 3: set validation = 2"):
         read_study(study)
+    assert read_study(study, {"validation": [2]}).validation == 2

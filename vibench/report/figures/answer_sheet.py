@@ -66,8 +66,9 @@ def answer(data: ProblemTables) -> CaptionedFigure | None:
 
 
 def _empty(panel: Axes, text: str) -> str:
-    """Leave a panel out, and say why."""
+    """Leave a panel out, and say why, in its place and in the caption."""
     panel.set_axis_off()
+    panel.text(0.5, 0.5, text, transform=panel.transAxes, ha="center", va="center")
     return text
 
 
