@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import scipy.linalg
@@ -18,8 +18,16 @@ from vibench.errors import RequestError, fault_line, placed, unknown_name
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.parameters import ParameterBox, outside
 from vibench.interfaces.problem import Problem
-from vibench.signatures import constructed
+from vibench.signatures import Rule, bordered, inside, is_plain
 from vibench.study.matrix import read_toml
+
+
+def _is_size(value: Any) -> bool:
+    return is_plain(value) and value.dtype.kind in "fiu" and bool((value >= 0.0).all())
+
+
+# Infinite where nothing is known.
+Sizes = Annotated[Any, Rule("an array of numbers of at least 0", _is_size)]
 
 
 class _Table(BaseModel):
@@ -43,7 +51,7 @@ class _File(_Table):
     prior: dict[str, _Normal] = {}
 
 
-@constructed
+@bordered
 @dataclass(frozen=True)
 class Data:
     """Measured values d of outputs, with normal noise.
@@ -73,15 +81,17 @@ class Data:
         object.__setattr__(self, "_whitening", whitening)
 
     @classmethod
-    def independent(cls, sensors: Sequence[str], values: Array, noise: Array) -> Data:
+    def independent(
+        cls, sensors: Annotated[Sequence[str], "k"], values: Annotated[Array, "k"], noise: Annotated[Array, "k"]
+    ) -> Data:
         """Data whose errors are independent, with the standard deviations `noise` (k,)."""
         return cls(tuple(sensors), np.asarray(values, float), np.diag(np.asarray(noise, float) ** 2))
 
-    def misfit(self, outputs: Array) -> float:
+    def misfit(self, outputs: Annotated[Array, "k"]) -> float:
         """½ (s − d)ᵀ C⁻¹ (s − d) of outputs s (k,): the negative logarithm of the likelihood, up to a constant."""
-        return self.interval(outputs, np.zeros(len(outputs)))[0]
+        return inside(self.interval)(outputs, np.zeros(len(outputs)))[0]
 
-    def interval(self, outputs: Array, bounds: Array) -> tuple[float, float]:
+    def interval(self, outputs: Annotated[Array, "k"], bounds: Annotated[Sizes, "k"]) -> tuple[float, float]:
         """The least and the largest misfit that outputs (k,) with errors within `bounds` (k,) may have."""
         if not np.isfinite(bounds).all():
             return 0.0, np.inf
@@ -92,13 +102,14 @@ class Data:
         return 0.5 * float(least @ least), 0.5 * float((size + reach) @ (size + reach))
 
 
+@bordered
 @dataclass(frozen=True)
 class Prior:
     """The prior on a parameter box: normal and truncated to the box, uniform where the deviation `sd` is infinite."""
 
-    box: ParameterBox
-    mean: Array
-    sd: Array
+    box: Annotated[ParameterBox, "d"]
+    mean: Annotated[Array, "d"]
+    sd: Annotated[Sizes, "d"]
 
     @classmethod
     def of(cls, box: ParameterBox, normal: Mapping[str, tuple[float, float]] = {}) -> Prior:
@@ -109,7 +120,7 @@ class Prior:
             mean[i], sd[i] = pair
         return cls(box, mean, sd)
 
-    def log_density(self, mu: Array) -> float:
+    def log_density(self, mu: Annotated[Array, "d"]) -> float:
         """Its logarithm at mu (d,), up to a constant; −∞ outside the box."""
         if outside(self.box, mu).any():
             return -np.inf

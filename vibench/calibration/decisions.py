@@ -45,7 +45,7 @@ from vibench.calibration.data import Data, outputs_of
 from vibench.errors import NumericalError, RequestError, UnsupportedError
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.formulations import FormulationAnswer
-from vibench.interfaces.parameters import outside
+from vibench.interfaces.parameters import ParameterBox, outside
 from vibench.interfaces.problem import Problem
 from vibench.linalg import EPS
 from vibench.model.bound_terms import CorrectionMode
@@ -58,7 +58,7 @@ from vibench.offline.compiled import loaded
 from vibench.offline.exported import exported
 from vibench.offline.models import Model
 from vibench.qp.verification import QPSolution
-from vibench.signatures import Rule, Seed, constructed
+from vibench.signatures import Rule, Seed, bordered, constructed, inside
 from vibench.stability.coercivity import share_of_diagonal
 from vibench.timing import timed
 
@@ -109,6 +109,7 @@ class Sensors:
         return ask
 
 
+@constructed
 class BoundedSensors:
     """Outputs of a reduced model with proved or verified bounds.
 
@@ -187,6 +188,7 @@ class BoundedSensors:
         return np.asarray(sums, float), int(counts.max())
 
 
+@constructed
 class CompiledSensors:
     """The outputs of `BoundedSensors` by a C program, compiled and loaded into this process: a query is one call.
 
@@ -257,7 +259,7 @@ class Counts:
     model_seconds: float
 
 
-@constructed
+@bordered
 class Decisions:
     """Whether a parameter fits data better than another one, as the high-fidelity model says.
 
@@ -273,6 +275,8 @@ class Decisions:
         The seed of this draw.
     """
 
+    _box: Annotated[ParameterBox, "d"]
+
     def __init__(
         self, problem: Problem, data: Data, predict: Predict | None,
         audit: Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)], seed: Seed,
@@ -287,7 +291,7 @@ class Decisions:
         # Methods compare with what they saw last.
         self._recent: LRUCache[bytes, Interval] = LRUCache(1000)
 
-    def interval(self, mu: Array) -> Interval:
+    def interval(self, mu: Annotated[Array, "d"]) -> Interval:
         """Bounds of the misfit at mu (d,), ½ (s − d)ᵀ C⁻¹ (s − d); minus that is the log-likelihood."""
         key, predict, known = mu.tobytes(), self._predict, Interval(0.0, inf, 0.0)
         if key in self._recent:
@@ -298,15 +302,16 @@ class Decisions:
             self.counts.model_seconds += seconds.cpu
             if guarantee is not Guarantee.CERTIFIED:
                 self.guarantee = Guarantee.VERIFIED
-            known = Interval(*self.data.interval(outputs, bounds), self.data.misfit(outputs))
+            misfits, misfit = inside(self.data.interval), inside(self.data.misfit)
+            known = Interval(*misfits(outputs, bounds), misfit(outputs))
         if key in self.answers:
             known.lower = known.upper = self.answers[key][0]
         self._recent[key] = known
         return known
 
-    def ask(self, mu: Array) -> float:
+    def ask(self, mu: Annotated[Array, "d"]) -> float:
         """The misfit of the high-fidelity model at mu (d,), which is kept; a `RefutedError` if bounds exclude it."""
-        key, known = mu.tobytes(), self.interval(mu)
+        key, known = mu.tobytes(), inside(self.interval)(mu)
         if key not in self.answers:
             misfit, seconds = self.earlier[key] if key in self.earlier else self._solved(mu)
             if not known.lower <= misfit <= known.upper:
@@ -320,25 +325,26 @@ class Decisions:
         outputs, seconds = timed(lambda: self._ask(mu))
         return self.data.misfit(outputs), seconds.cpu
 
-    def less(self, a: Array, b: Array, shift: float = 0.0) -> bool:
+    def less(self, a: Annotated[Array, "d"], b: Annotated[Array, "d"], shift: float = 0.0) -> bool:
         """Whether the high-fidelity misfit at a (d,) is less than that at b (d,) plus a shift.
 
         Raises a `RefutedError` if an answer of the high-fidelity model contradicts the bounds.
         """
-        one, other = self.interval(a), self.interval(b)
+        interval, ask = inside(self.interval), inside(self.ask)
+        one, other = interval(a), interval(b)
         verdict = one.below(other, shift)
         self.counts.decisions += 1
         if verdict is None:
             self.counts.undecided += 1
             # Later decisions compare with b again, the present state of a chain: it is asked first.
             for mu in (b, a):
-                self.ask(mu)
+                ask(mu)
                 if (verdict := one.below(other, shift)) is not None:
                     break
         elif self._predict is not None and self._random.random() < self._audit:
             self.counts.audits += 1
-            self.ask(a)
-            self.ask(b)
+            ask(a)
+            ask(b)
         self.counts.wrong += bool(self._predict is not None and (one.middle < other.middle + shift) != verdict)
         return bool(verdict)
 
