@@ -58,6 +58,8 @@ def bordered(called: F, owner: type | None = None, declared: Callable[..., Any] 
         for name, member in list(vars(called).items()):
             if isinstance(member, types.FunctionType) and (name == "__init__" or name[0] != "_"):
                 setattr(called, name, bordered(member, called if name[0] != "_" else None))
+            elif isinstance(member, classmethod) and name[0] != "_":
+                setattr(called, name, classmethod(bordered(member.__func__)))
         return called
     # Annotations may name what is defined below the function.
     signature = functools.cache(lambda: _Signature(called, owner, declared or called))
@@ -177,7 +179,7 @@ def _attributes(base: type) -> dict[str, Rule]:
 
 @functools.cache
 def rule_of(hint: Any) -> Rule:
-    """The rule of a type; what cannot be tested, such as a protocol, has every value."""
+    """The rule of a type; of a protocol only the names of its methods are tested."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return _annotated(rule_of(parts[0]), parts[1:])
@@ -239,7 +241,7 @@ def _rule_of_class(kind: Any) -> Rule:
     if kind in scalars or kind is Any or not isinstance(kind, type):
         return scalars.get(kind) or Rule("", lambda _: True)
     if getattr(kind, "_is_protocol", False):
-        return Rule("a function", callable) if "__call__" in vars(kind) else rule_of(Any)
+        return Rule("a function", callable) if "__call__" in vars(kind) else _rule_of_protocol(kind)
     hints = typing.get_type_hints(kind, include_extras=True) if kind.__module__.startswith("vibench") else {}
     parts = tuple((name, rule) for name, rule in ((n, rule_of(hint)) for n, hint in hints.items()) if rule.axes)
 
@@ -247,6 +249,11 @@ def _rule_of_class(kind: Any) -> Rule:
         return isinstance(value, kind) and all(rule.holds(getattr(value, name, None)) for name, rule in parts)
 
     return Rule(f"{'an' if kind.__name__[0] in 'AEIOU' else 'a'} {kind.__name__}", holds, parts=parts)
+
+
+def _rule_of_protocol(kind: Any) -> Rule:
+    names = [name for name, member in vars(kind).items() if inspect.isfunction(member) and name[0] != "_"]
+    return Rule(f"an object with {', '.join(names)}", lambda value: all(hasattr(value, name) for name in names))
 
 
 def _in_range(number: Any) -> bool:
@@ -270,7 +277,7 @@ def _has_axes(value: Any, axes: tuple[str, ...]) -> bool:
 
 def _sizes(name: str, value: Any, rule: Rule) -> Iterator[tuple[str, int, str]]:
     """The sizes of the axes of an argument, and of its parts."""
-    if rule.axes and value is not None:
+    if rule.axes and not isinstance(value, Real | None):
         shape = (value.dim,) if hasattr(value, "dim") else getattr(value, "shape", None) or (len(value),)
         pairs = zip(reversed(rule.axes), reversed(shape), strict=False)
         yield from ((axis, count, name) for axis, count in pairs if axis != "…")

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import scipy.linalg
@@ -19,8 +19,16 @@ from vibench.errors import RequestError, fault_line, placed, unknown_name
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.parameters import ParameterBox, outside
 from vibench.interfaces.problem import Problem
-from vibench.signatures import constructed
+from vibench.signatures import Rule, bordered, inside, is_plain
 from vibench.study.matrix import read_toml
+
+
+def _is_size(value: Any) -> bool:
+    return is_plain(value) and value.dtype.kind in "fiu" and bool((value >= 0.0).all())
+
+
+# Infinite where nothing is known.
+Sizes = Annotated[Any, Rule("an array of numbers of at least 0", _is_size)]
 
 
 class _Table(BaseModel):
@@ -44,7 +52,7 @@ class _File(_Table):
     prior: dict[str, _Normal] = {}
 
 
-@constructed
+@bordered
 @dataclass(frozen=True)
 class Data:
     """Measured values d of outputs, with normal noise.
@@ -74,15 +82,20 @@ class Data:
         object.__setattr__(self, "_whitening", whitening)
 
     @classmethod
-    def independent(cls, sensors: Sequence[str], values: Array, noise: Array) -> Data:
+    def independent(
+        cls, sensors: Annotated[Sequence[str], "k"], values: Annotated[Array, "k"], noise: Annotated[Array, "k"]
+    ) -> Data:
         """Data whose errors are independent, with the standard deviations `noise` (k,)."""
         return cls(tuple(sensors), np.asarray(values, float), np.diag(np.asarray(noise, float) ** 2))
 
-    def misfit(self, outputs: Array) -> float:
+    def misfit(self, outputs: Annotated[Array, "k"]) -> float:
         """½ (s − d)ᵀ C⁻¹ (s − d) of outputs s (k,): the negative logarithm of the likelihood, up to a constant."""
-        return self.interval(outputs, np.zeros(len(outputs)))[0]
+        return inside(self.interval)(outputs, np.zeros(len(outputs)))[0]
 
-    def interval(self, outputs: Array, bounds: Array, correlation: Array | None = None) -> tuple[float, float]:
+    def interval(
+        self, outputs: Annotated[Array, "k"], bounds: Annotated[Sizes, "k"],
+        correlation: Annotated[Array, "k", "k"] | None = None,
+    ) -> tuple[float, float]:  # fmt: skip
         """The least and the largest misfit that outputs (k,) with errors e within `bounds` b (k,) may have.
 
         With a `correlation` R (k×k) they satisfy (gᵀe)² ≤ cᵀRc for any g (k,) and c = (g_i b_i), too.
@@ -102,13 +115,14 @@ class Data:
         return max(lower, middle - linear), min(upper, middle + linear + 0.5 * float(reach @ reach))
 
 
+@bordered
 @dataclass(frozen=True)
 class Prior:
     """The prior on a parameter box: normal and truncated to the box, uniform where the deviation `sd` is infinite."""
 
-    box: ParameterBox
-    mean: Array
-    sd: Array
+    box: Annotated[ParameterBox, "d"]
+    mean: Annotated[Array, "d"]
+    sd: Annotated[Sizes, "d"]
 
     @classmethod
     def of(cls, box: ParameterBox, normal: Mapping[str, tuple[float, float]] = {}) -> Prior:
@@ -119,7 +133,7 @@ class Prior:
             mean[i], sd[i] = pair
         return cls(box, mean, sd)
 
-    def log_density(self, mu: Array) -> float:
+    def log_density(self, mu: Annotated[Array, "d"]) -> float:
         """Its logarithm at mu (d,), up to a constant; −∞ outside the box."""
         if outside(self.box, mu).any():
             return -np.inf

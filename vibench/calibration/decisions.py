@@ -45,7 +45,7 @@ from vibench.calibration.data import Data, outputs_of
 from vibench.errors import NumericalError, RequestError, UnsupportedError
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.formulations import FormulationAnswer
-from vibench.interfaces.parameters import outside
+from vibench.interfaces.parameters import ParameterBox, outside
 from vibench.interfaces.problem import Problem
 from vibench.linalg import EPS
 from vibench.linalg.inner_product import InnerProduct
@@ -60,7 +60,7 @@ from vibench.offline.compiled import loaded
 from vibench.offline.exported import exported
 from vibench.offline.models import Model
 from vibench.qp.verification import QPSolution, extended
-from vibench.signatures import Rule, Seed, constructed
+from vibench.signatures import Rule, Seed, bordered, constructed, inside
 from vibench.stability.coercivity import share_of_diagonal
 from vibench.timing import timed
 
@@ -115,6 +115,7 @@ class Sensors:
         return ask
 
 
+@constructed
 class BoundedSensors:
     """Outputs of a reduced model with proved or verified bounds.
 
@@ -206,6 +207,7 @@ def _correlation(X: InnerProduct, functionals: Array, norms: Array) -> Array | N
     return np.asarray(p.T @ product, float) / np.outer(norms, norms) if is_sharp else None
 
 
+@constructed
 class CompiledSensors:
     """The outputs of `BoundedSensors` by a C program, compiled and loaded into this process: a query is one call.
 
@@ -280,7 +282,7 @@ class Counts:
     model_seconds: float
 
 
-@constructed
+@bordered
 class Decisions:
     """Whether a parameter fits data better than another one, as the high-fidelity model says.
 
@@ -297,6 +299,8 @@ class Decisions:
         The seed of this draw.
     """
 
+    _box: Annotated[ParameterBox, "d"]
+
     def __init__(
         self, problem: Problem, data: Data, models: Sequence[Predict],
         audit: Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)], seed: Seed,
@@ -311,7 +315,7 @@ class Decisions:
         # Methods compare with what they saw last.
         self._recent: LRUCache[bytes, Interval] = LRUCache(1000)
 
-    def interval(self, mu: Array) -> Interval:
+    def interval(self, mu: Annotated[Array, "d"]) -> Interval:
         """Bounds of the misfit at mu (d,), ½ (s − d)ᵀ C⁻¹ (s − d); minus that is the log-likelihood."""
         if (key := mu.tobytes()) not in self._recent:
             known = self._recent[key] = Interval(0.0, inf, 0.0, 0)
@@ -332,16 +336,16 @@ class Decisions:
         self.counts.model_seconds += seconds.cpu
         if guarantee is not Guarantee.CERTIFIED:
             self.guarantee = Guarantee.VERIFIED
-        lower, upper = self.data.interval(outputs, bounds, correlation)
+        lower, upper = inside(self.data.interval)(outputs, bounds, correlation)
         if lower > known.upper or upper < known.lower:
             both = f"{known.lower:.6g} to {known.upper:.6g} by one model, {lower:.6g} to {upper:.6g} by another one"
             raise RefutedError(f"the bounds are refuted at mu = {mu.tolist()}: the misfit is {both}")
         known.lower, known.upper = max(lower, known.lower), min(upper, known.upper)
-        known.middle, known.level = self.data.misfit(outputs), known.level + 1
+        known.middle, known.level = inside(self.data.misfit)(outputs), known.level + 1
 
-    def ask(self, mu: Array) -> float:
+    def ask(self, mu: Annotated[Array, "d"]) -> float:
         """The misfit of the high-fidelity model at mu (d,), which is kept; a `RefutedError` if bounds exclude it."""
-        key, known = mu.tobytes(), self.interval(mu)
+        key, known = mu.tobytes(), inside(self.interval)(mu)
         if key not in self.answers:
             misfit, seconds = self.earlier[key] if key in self.earlier else self._solved(mu)
             if not known.lower <= misfit <= known.upper:
@@ -356,12 +360,13 @@ class Decisions:
         outputs, seconds = timed(lambda: self._ask(mu))
         return self.data.misfit(outputs), seconds.cpu
 
-    def less(self, a: Array, b: Array, shift: float = 0.0) -> bool:
+    def less(self, a: Annotated[Array, "d"], b: Annotated[Array, "d"], shift: float = 0.0) -> bool:
         """Whether the high-fidelity misfit at a (d,) is less than that at b (d,) plus a shift.
 
         Raises a `RefutedError` if an answer of the high-fidelity model contradicts the bounds.
         """
-        one, other = self.interval(a), self.interval(b)
+        interval, ask = inside(self.interval), inside(self.ask)
+        one, other = interval(a), interval(b)
         verdict = one.below(other, shift)
         self.counts.decisions += 1
         # Later decisions compare with b again, the present state of a chain: it is queried and asked first.
@@ -371,13 +376,13 @@ class Decisions:
         if verdict is None:
             self.counts.undecided += 1
             for mu in (b, a):
-                self.ask(mu)
+                ask(mu)
                 if (verdict := one.below(other, shift)) is not None:
                     break
         elif self._models and self._random.random() < self._audit:
             self.counts.audits += 1
-            self.ask(a)
-            self.ask(b)
+            ask(a)
+            ask(b)
         self.counts.wrong += bool(self._models and (one.middle < other.middle + shift) != verdict)
         return bool(verdict)
 

@@ -12,7 +12,7 @@ from vibench.arrays import Array, Mask
 from vibench.calibration.data import Prior
 from vibench.calibration.decisions import Decisions
 from vibench.errors import foreign
-from vibench.signatures import constructed
+from vibench.signatures import Count, Seed, constructed, inside
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,7 +27,7 @@ class Metropolis:
     2009); afterwards both are fixed. Random numbers are the same ones whatever is decided.
     """
 
-    def __init__(self, decisions: Decisions, prior: Prior, burn_in: int, seed: int) -> None:
+    def __init__(self, decisions: Decisions, prior: Prior, burn_in: Count, seed: Seed) -> None:
         self.decisions, self.prior, self.burn_in = decisions, prior, burn_in
         self._random = np.random.default_rng(seed)
         box, start = prior.box, np.clip(prior.mean, prior.box.lower, prior.box.upper)
@@ -57,8 +57,9 @@ class Metropolis:
         root = np.linalg.cholesky(self._scatter + 1e-12 * np.eye(box.dim))
         proposal = present + np.exp(self._log_scale) * (root @ normal) * box.widths
         # The logarithm of a uniform number in (0, 1].
-        gain = self.prior.log_density(proposal) - self.prior.log_density(present) - np.log1p(-uniform)
-        moves = bool(gain > -np.inf) and self.decisions.less(proposal, present, float(gain))
+        density, less = inside(self.prior.log_density), inside(self.decisions.less)
+        gain = density(proposal) - density(present) - np.log1p(-uniform)
+        moves = bool(gain > -np.inf) and less(proposal, present, float(gain))
         self._visited.append(proposal if moves else present)
         self._accepted.append(moves)
         if self.steps <= self.burn_in:

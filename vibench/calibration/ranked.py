@@ -10,12 +10,12 @@ from vibench.arrays import Array
 from vibench.calibration.decisions import Decisions
 from vibench.errors import foreign
 from vibench.interfaces.parameters import ParameterBox
-from vibench.signatures import Positive, Seed, bordered
+from vibench.signatures import AtLeastOne, Positive, Seed, bordered, inside
 
 
 @bordered
 def minimise(
-    decisions: Decisions, box: ParameterBox, *, seed: Seed, iterations: int, tolx: Positive
+    decisions: Decisions, box: ParameterBox, *, seed: Seed, iterations: AtLeastOne, tolx: Positive
 ) -> tuple[Array, Array]:
     """Minimise the misfit over a parameter box by CMA-ES (Hansen 2016), from its centre.
 
@@ -27,14 +27,17 @@ def minimise(
     """
     with foreign("the package cma, of the extra 'calibration', cannot be used"):
         import cma  # noqa: PLC0415  an extra
-    # Criteria that look at values are switched off: ranks are no values. A seed of 0 means the clock.
+    # Criteria that look at values are switched off: ranks are no values. Seeds are of 32 bits, and 0 is
+    # the clock.
     ignored = dict.fromkeys(("tolfun", "tolfunhist"), 0.0) | dict.fromkeys(("tolflatfitness", "tolstagnation"), np.inf)
     unit_cube = [np.zeros(box.dim), np.ones(box.dim)]
-    limits = {"seed": seed + 1, "bounds": unit_cube, "tolx": tolx, "maxiter": iterations, "verbose": -9}
+    limits = {"seed": seed % (2**32 - 1) + 1, "bounds": unit_cube, "tolx": tolx, "maxiter": iterations, "verbose": -9}
     strategy = cma.CMAEvolutionStrategy(np.full(box.dim, 0.5), 0.2, limits | ignored)
 
+    less = inside(decisions.less)
+
     def compare(one: tuple[int, Array], other: tuple[int, Array]) -> int:
-        return -1 if decisions.less(one[1], other[1]) else 1
+        return -1 if less(one[1], other[1]) else 1
 
     best, path = 0.5 * (box.lower + box.upper), []
     while not strategy.stop():
@@ -44,6 +47,6 @@ def minimise(
         ranks = np.empty(len(unit))
         ranks[[number for number, _ in order]] = np.arange(len(unit))
         strategy.tell(unit, ranks.tolist())
-        best = order[0][1] if decisions.less(order[0][1], best) else best
+        best = order[0][1] if less(order[0][1], best) else best
         path.append(box.lower + np.asarray(strategy.mean) * box.widths)
     return best, np.array(path)

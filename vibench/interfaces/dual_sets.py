@@ -123,7 +123,8 @@ class DualSet:
             raise RequestError("a row of the dual set is in two blocks")
 
     @classmethod
-    def intervals(cls, rows: Indices, radius: float | Array) -> DualSet:
+    @bordered
+    def intervals(cls, rows: Annotated[Indices, "k"], radius: float | Annotated[Array, "k"]) -> DualSet:
         """The set with |λ_i| ≤ `radius` in some rows (k,)."""
         radii = np.broadcast_to(np.asarray(radius, float), np.shape(rows)).copy()
         return cls((Blocks(BlockKind.INTERVAL, np.asarray(rows, np.intp)[:, None], radii),) if len(rows) else ())

@@ -43,6 +43,7 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.qp.exact import Rows, rows_that_matter
 from vibench.qp.scaling import row_norms
 from vibench.qp.status import Status
+from vibench.signatures import NotNegative
 from vibench.text import above
 
 
@@ -111,8 +112,9 @@ class Inverse(Protocol):
 
 @np.errstate(over="ignore", invalid="ignore")  # a diverging solver returns infinite residuals
 def kkt_residuals(
-    program: VariationalInequality, x: Array, alpha: Array, inverse: Inverse | None = None, accuracy: float = 0.0
-) -> Residuals:
+    program: VariationalInequality, x: Annotated[Array, "n"], alpha: Annotated[Array, "m"],
+    inverse: Inverse | None = None, accuracy: NotNegative = 0.0,
+) -> Residuals:  # fmt: skip
     """Natural residuals of x (n,), α (m,) ≥ 0 for a dense or sparse program.
 
     `inverse` is the factorisation of A where there is one already. Residuals up to the `accuracy` are good enough: F of
@@ -268,7 +270,9 @@ def _over(value: float, scale: float) -> float:
     return 0.0 if value == 0.0 else value / scale if scale != 0.0 else float("inf")
 
 
-def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) -> tuple[Status, str, Residuals | None]:
+def verify(
+    program: VariationalInequality, answer: QPSolution, accuracy: NotNegative
+) -> tuple[Status, str, Residuals | None]:
     """Classify a solution by recomputed residuals: status, reason ("" when ok), residuals if they exist."""
     if answer.x is None or answer.alpha is None:
         if infeasibility_certificate(program) is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
 from vibench.arrays import Array, Mask
@@ -11,7 +13,9 @@ from vibench.qp.scaling import peak, ratio
 from vibench.qp.solve import solve_qp
 
 
-def subtract_cone_component(theta: Array, generators: Array, W: InnerProduct) -> tuple[Array, str]:
+def subtract_cone_component(
+    theta: Annotated[Array, "m"], generators: Annotated[Array, "m", "r"], W: Annotated[InnerProduct, "m"]
+) -> tuple[Array, str]:
     """Subtract from θ the closest Υ of the cone with θ − Υ ≥ 0 coefficientwise: line 9 of Algorithm 2 of Niakh et al.
 
     θ ≥ 0 (m,) is a snapshot, the generators of the cone are ν ≥ 0 (m×r). The result is θ − Υ (m,), without negative

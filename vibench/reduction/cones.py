@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import scipy.linalg
 from scipy.optimize import nnls
 
 from vibench.arrays import Array, Indices, Mask
-from vibench.errors import NumericalError
+from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.strategies import ReducedSet, Stop, no_free, rays
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
-from vibench.signatures import constructed
+from vibench.signatures import Count, bordered
 
 # A snapshot whose relative distance from the cone is below this is reproduced up to round-off.
 REPRODUCED = 1e-12
@@ -25,6 +25,7 @@ REPRODUCED = 1e-12
 TIE = 1e-9
 
 
+@bordered
 class LazyMaximum:
     """Argmax over indicators that are non-increasing from one greedy step to the next.
 
@@ -33,7 +34,9 @@ class LazyMaximum:
     are those (P,) of the first step. `evaluations` counts evaluations of an indicator.
     """
 
-    def __init__(self, first: Array) -> None:
+    _bounds: Annotated[Any, "P"]
+
+    def __init__(self, first: Annotated[Array, "P"]) -> None:
         self._bounds = np.array(first, dtype=float)
         self._tie = TIE * float(np.max(self._bounds, initial=0.0))
         self.evaluations = 0
@@ -53,13 +56,19 @@ class LazyMaximum:
             fresh[p] = True
             self.evaluations += 1
 
-    def bound(self, bounds: Array) -> None:
+    def bound(self, bounds: Annotated[Array, "P"]) -> None:
         """Apply upper bounds (P,) of the current indicators where they are below the stored ones."""
         self._bounds = np.minimum(self._bounds, bounds)
 
-    def exclude(self, index: int) -> None:
+    def exclude(self, index: Count) -> None:
         """Exclude an index from all later choices."""
+        _refuse_beyond(index, len(self._bounds))
         self._bounds[index] = -np.inf
+
+
+def _refuse_beyond(index: int, count: int) -> None:
+    if index >= count:
+        raise RequestError(f"there is no index {index} among {count}")
 
 
 @dataclass(frozen=True)
@@ -77,7 +86,7 @@ def project_on_cone(
     return _project_whitened(W.whiten(generators), W.whiten(theta))
 
 
-def hull_distances(points: Array, targets: Array) -> Array:
+def hull_distances(points: Annotated[Array, "m", "r"], targets: Annotated[Array, "m", "k"]) -> Array:
     """Distances (k,) of targets (m×k) from the convex hull of zero and points (m×r), by nonnegative least squares.
 
     Points and targets are whitened. The weight of zero is one more unknown, and a row that is heavy beside all others
@@ -132,7 +141,7 @@ def _project_whitened(generators: Array, theta: Array) -> Projection:
     return Projection(np.asarray(coefficients), float(distance))
 
 
-@constructed
+@bordered
 class GrowingCone:
     """A cone that grows by one generator at a time, and the snapshot that is farthest from it.
 
@@ -161,15 +170,15 @@ class GrowingCone:
         """Whether the cone is large enough, or reproduces all snapshots to round-off."""
         return stop.reached(self.generators.shape[1], self.error) or self.error <= REPRODUCED
 
-    def add(self, direction: Array, note: str = "") -> bool:
+    def add(self, direction: Annotated[Array, "m"], note: str = "") -> bool:
         """Add the generator of a direction (m,), part of `farthest`, with a `note` on any deviation from the algorithm.
 
-        `False` where the direction is nothing but round-off.
+        `False` where the direction is nothing but round-off, as it is if all snapshots are reproduced.
         """
         if note:
             self._fallbacks.append(f"generator {self.generators.shape[1] + 1}: {note}")
         length = float(self._W.norm(direction))
-        if length <= REPRODUCED * self._norms[self.farthest]:
+        if not self.error or length <= REPRODUCED * self._norms[self.farthest]:
             # Normalised, round-off would be an arbitrary generator.
             return False
         self.generators = np.column_stack([self.generators, direction / length])
@@ -201,13 +210,13 @@ def greedy_cone(snapshots: Annotated[Array, "m", "P"], W: Annotated[InnerProduct
     return cone.result()
 
 
-def refuse_negative(snapshots: Array) -> None:
+def refuse_negative(snapshots: Annotated[Array, "m", "Q"]) -> None:
     """Raise a `NumericalError` if snapshots (m×Q) have a negative coefficient: they would not be in W⁺."""
     if np.min(snapshots, initial=0.0) < 0.0:
         raise NumericalError(f"a multiplier snapshot has the negative coefficient {snapshots.min():.1e}")
 
 
-@constructed
+@bordered
 class LazyDistances:
     """Largest distance of snapshots from a growing cone, relative to the largest norm, with few projections.
 
@@ -218,6 +227,8 @@ class LazyDistances:
     The snapshots (m×Q), not all zero, are `whitened`: in coordinates in which the norm is Euclidean.
     """
 
+    _snapshots: Annotated[Any, "m", "Q"]
+
     def __init__(self, whitened: Annotated[Array, "m", "Q"]) -> None:
         self._snapshots = whitened
         norms = np.linalg.norm(whitened, axis=0)
@@ -226,8 +237,12 @@ class LazyDistances:
         self._coefficients = np.zeros((0, whitened.shape[1]))  # one point of the cone for every snapshot
         self.maximum = LazyMaximum(norms / self._largest)
 
-    def widen(self, generators: Array, taken: int | None = None) -> None:
+    def widen(self, generators: Annotated[Array, "m", "r"], taken: Count | None = None) -> None:
         """Add the last of the generators (m×r, unit norm, whitened); the snapshot `taken` is never chosen again."""
+        if generators.shape[1] != (count := len(self._coefficients) + 1):
+            raise RequestError(
+                f"widen is given {generators.shape[1]} generators, expected {count}, the last of them new"
+            )
         old, new = _best_combination(self._generators @ self._coefficients, generators[:, -1], self._snapshots)
         self._coefficients = np.vstack([self._coefficients * old, new])
         self._generators = generators
@@ -245,8 +260,9 @@ class LazyDistances:
         """Index of the snapshot farthest from the cone, and its distance, those taken excluded."""
         return self.maximum.next(self._distance)
 
-    def residual(self, q: int) -> Array:
+    def residual(self, q: Count) -> Array:
         """Snapshot minus its stored point of the cone (m,), which is its projection for the index from `next`."""
+        _refuse_beyond(q, self._snapshots.shape[1])
         return np.asarray(self._snapshots[:, q] - self._generators @ self._coefficients[:, q])
 
     def _distance(self, q: int) -> float:

@@ -2,37 +2,41 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
 import numpy as np
 import scipy.linalg
 
 from vibench.arrays import Array, Indices
-from vibench.signatures import Count, constructed
+from vibench.signatures import Count, NotNegative, bordered
 
 
-@constructed
+@bordered
 class Cubature:
     """The conditions of a cubature, each with a random sign in one of few sums, which keep its residual.
 
     `size` conditions, N', are added at a time; the cubature chooses from `count` columns, e.
     """
 
+    _sums: Annotated[Any, "sums", "e"]
+
     def __init__(self, size: Count, count: Count) -> None:
         # Far more sums than a cubature has columns represent all conditions.
         self._sums, self._rng = np.zeros((max(800, 8 * size), count)), np.random.default_rng(0)
 
-    def add(self, conditions: Array, weight: float) -> None:
+    def add(self, conditions: Annotated[Array, "N'", "e"], weight: float) -> None:
         """Add conditions (N'×e), relative to their sum over all columns."""
         if size := float(np.linalg.norm(conditions.sum(axis=1))):
             signs = self._rng.choice([-1.0, 1.0], len(conditions))
             where = self._rng.choice(len(self._sums), len(conditions), replace=False)
             self._sums[where] += (weight / size * signs)[:, None] * conditions
 
-    def columns(self, tolerance: float) -> tuple[Indices, Array]:
+    def columns(self, tolerance: NotNegative) -> tuple[Indices, Array]:
         """Few columns (j,) and weights (j,) > 0 with which all conditions are met to a tolerance; see `cubature`."""
         return cubature(self._sums, tolerance)
 
 
-def cubature(conditions: Array, tolerance: float) -> tuple[Indices, Array]:
+def cubature(conditions: Annotated[Array, "k", "e"], tolerance: NotNegative) -> tuple[Indices, Array]:
     """Few columns (j,) of conditions (k×e) and weights (j,) > 0 with which they have about the sum of all.
 
     Nonnegative least squares after Lawson and Hanson (1974), ended at a relative residual as by Farhat et al. (2015);

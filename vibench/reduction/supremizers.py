@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated
@@ -10,12 +10,13 @@ from typing import Annotated
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.errors import NumericalError
+from vibench.arrays import Array, Indices, SparseMatrix, real_matrix
+from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.problem import ContactLoads
 from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal, Elimination
 from vibench.linalg.factorisations import implementation
 from vibench.linalg.inner_product import InnerProduct, orthogonal_factorisation
+from vibench.signatures import Rule
 
 
 def supremizers(
@@ -55,7 +56,7 @@ class ConstraintClasses:
         return np.array(constants)[self.members] * np.abs(self.factors)
 
 
-def constraint_classes(matrices: Iterable[SparseMatrix]) -> ConstraintClasses:
+def constraint_classes(matrices: Collection[SparseMatrix] | Iterator[SparseMatrix]) -> ConstraintClasses:
     """Sort matrices into classes of proportional ones; each may be written over the one before it.
 
     Where every B(mu) is one matrix times a scalar, one supremizer space replaces one for each parameter.
@@ -63,7 +64,7 @@ def constraint_classes(matrices: Iterable[SparseMatrix]) -> ConstraintClasses:
     classes: list[tuple[SparseMatrix, Array]] = []
     placed: list[tuple[int, float]] = []
     for matrix in matrices:
-        fingerprint = _fingerprint(matrix)
+        fingerprint = _fingerprint(real_matrix(matrix, "a constraint matrix"))
         for k, (representative, other) in enumerate(classes):
             # Fingerprints of proportional matrices are equal up to sign and round-off: a cheap necessary condition.
             distances = (float(np.abs(fingerprint + sign * other).max(initial=0.0)) for sign in (-1.0, 1.0))
@@ -221,7 +222,9 @@ def _constrained_unknowns(matrices: Sequence[SparseMatrix]) -> Indices:
     return np.unique(np.concatenate([sp.csr_array(B).indices for B in matrices]))
 
 
-def projected_supremizers(Z: Array, B: SparseMatrix, eta: Array) -> Array:
+def projected_supremizers(
+    Z: Annotated[Array, "n", "N'"], B: Annotated[SparseMatrix, "m", "n"], eta: Annotated[Array, "m", "k"]
+) -> Array:
     """The product ZᵀBᵀη (N'×k) from the rows of Z (n×N') at the nonzero columns of B (m×n)."""
     rows = _constrained_unknowns([B])
     return np.asarray(Z[rows].T @ _loads(B, rows, eta))
@@ -232,12 +235,15 @@ def _loads(B: SparseMatrix, dofs: Indices, eta: Array) -> Array:
 
 
 def supremizer_coordinates(
-    V: InnerProduct, basis: Array, matrices: Sequence[SparseMatrix], eta: Array
-) -> tuple[Coordinates, list[Array]]:
+    V: Annotated[InnerProduct, "n"], basis: Annotated[Array, "n", "N"],
+    matrices: Annotated[Sequence[SparseMatrix], Rule("at least one matrix", len)], eta: Annotated[Array, "m", "k"],
+) -> tuple[Coordinates, list[Array]]:  # fmt: skip
     """Coordinates for greedy algorithms over supremizers, and those (d×k) of T(mu)η for every matrix.
 
     From a V-orthonormal basis of V_N (n×N), constraint matrices B(mu) (m×n) and multipliers η (m×k).
     """
+    if wrong := [B.shape for B in matrices if B.shape != (len(eta), V.dim)]:
+        raise RequestError(f"a constraint matrix has the shape {wrong[0]}, expected {(len(eta), V.dim)}")
     space: Coordinates
     constrained = _constrained_unknowns(matrices)
     if len(constrained) > MANY_UNKNOWNS:  # unknowns that no multiplier loads need no dense work

@@ -44,7 +44,7 @@ class ConeBasis:
     """
 
     # Generators (m×R), unit norm in W.
-    chi: Array
+    chi: Annotated[Array, "m", "R"]
     # W-orthonormal basis of span χ (m×rank): the leading left singular vectors.
     span: Array
     # G (R×R), and which generators may be used with either sign (R,).
@@ -96,7 +96,9 @@ class InfSup:
         return InfSup(size * self.span, size * self.cone_lower, size * self.cone_upper, self.sharp)
 
 
-def cone_basis(chi: Array, W: InnerProduct, free: Mask | None = None) -> ConeBasis:
+def cone_basis(
+    chi: Annotated[Array, "m", "R"], W: Annotated[InnerProduct, "m"], free: Annotated[Mask, "R"] | None = None
+) -> ConeBasis:
     """`ConeBasis` of generators (m×R) of unit norm; `free` (R,) marks those without a sign, none by default."""
     whitened = W.whiten(chi)
     free = no_free(chi.shape[1]) if free is None else free
@@ -141,13 +143,13 @@ def stability_ratio(beta: float, reachable: float) -> float:
     return beta / reachable if VANISHES < reachable < float("inf") else 1.0
 
 
-def inf_sup_on(Z: Array, B: SparseMatrix, cone: ConeBasis) -> InfSup:
+def inf_sup_on(Z: Annotated[Array, "n", "N'"], B: Annotated[SparseMatrix, "m", "n"], cone: ConeBasis) -> InfSup:
     """Constants of a primal space with V-orthonormal basis Z (n×N') at the parameter of B (m×n)."""
     projected = projected_supremizers(Z, B, np.hstack([cone.span, cone.chi]))
     return inf_sup(projected[:, : cone.rank], projected[:, cone.rank :], cone)
 
 
-def inf_sup_full(V: InnerProduct, B: SparseMatrix, cone: ConeBasis) -> InfSup:
+def inf_sup_full(V: Annotated[InnerProduct, "n"], B: Annotated[SparseMatrix, "m", "n"], cone: ConeBasis) -> InfSup:
     """Constants of the whole of V, where T(mu)η attains the supremum: those of online supremizers."""
     on_span, on_generators = (V.whiten_functional(np.asarray(B.T @ eta)) for eta in (cone.span, cone.chi))
     return inf_sup(on_span, on_generators, cone)

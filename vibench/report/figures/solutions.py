@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,6 +15,7 @@ from vibench.interfaces.outputs import Picture
 from vibench.report.figures.data import ProblemTables
 from vibench.report.figures.style import COLOURS, CaptionedFigure, Layout, Sheet
 from vibench.results.pictures import Shown
+from vibench.signatures import Rule
 
 Limits = tuple[float, float]
 
@@ -89,7 +90,7 @@ def draw_multiplier(axes: Axes, picture: Picture, limits: Limits, *, bar: bool =
     _plane(axes, filled, picture.multiplier_name if bar else "")
 
 
-def name_axes(axes: Axes, unit: str, places: Sequence[Array]) -> None:
+def name_axes(axes: Axes, unit: str, places: Annotated[Sequence[Array], Rule("at least one array", len)]) -> None:
     """Name the axes of space, with the same limits wherever the points of these pictures are drawn."""
     points = np.hstack(places)
     ends = np.array([points.min(axis=1), points.max(axis=1)]) if points.size else np.zeros((2, len(points)))

@@ -8,13 +8,14 @@ import re
 import textwrap
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
+from numbers import Real
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, NamedTuple
+from typing import Annotated, Any, BinaryIO, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -22,6 +23,9 @@ from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vibench.errors import RequestError
+from vibench.files import writing
+from vibench.signatures import AtLeastOne, Count, Positive, Rule, bordered, constructed, refuse_others, rule_of
 from vibench.text import printable
 
 # Equidistant in lightness (CIELAB, 22 to 78 in steps of 8), so that grey print keeps them apart, with the hues that are
@@ -30,9 +34,19 @@ COLOURS = ("#520186", "#91071B", "#A22174", "#615CDB", "#DF5225", "#2CA980", "#A
 # Triangles to the left and to the right are missing: they mark break-evens.
 MARKERS = "os^vDPX*dph"
 
+
+def _are_numbers(value: Any) -> bool:
+    is_list = isinstance(value, list | tuple) and all(isinstance(one, Real) for one in value)
+    kind = "f" if is_list else getattr(getattr(value, "dtype", None), "kind", "")
+    return kind in set("fiub") and np.ndim(value) == 1
+
+
+Points = Annotated[Any, Rule("numbers of points", _are_numbers), "k"]
+Formats = Annotated[Collection[str], Rule("formats of png, svg and pdf", {"png", "svg", "pdf"}.issuperset)]
 Share = Literal["none", "all", "row", "col"]
 
 
+@bordered
 @dataclass(frozen=True)
 class Look:
     """Colour and marker of a strategy or solver, the line style of its assembly, and a rank among those that share all.
@@ -42,10 +56,10 @@ class Look:
 
     colour: str
     marker: str
-    rank: int
-    dashes: Any = "-"
+    rank: Count
+    dashes: Literal["-", "--", "-.", ":"] | tuple[float, tuple[float, ...]] = "-"
 
-    def line(self, count: int) -> dict[str, Any]:
+    def line(self, count: Count) -> dict[str, Any]:
         """Arguments of `Axes.plot` for a line of `count` points."""
         # About nine markers identify a line in grey print; their offset keeps those of equal curves apart.
         every = (self.rank % 3, max(1, count // 9))
@@ -64,7 +78,9 @@ class Look:
 HIGH_FIDELITY_LOOK = Look("#000000", "s", 0)
 
 
-class Series(NamedTuple):
+@constructed
+@dataclass(frozen=True)
+class Series:
     """A series of a figure: name of its strategy or solver, variant such as a tolerance, and `way` of its queries."""
 
     name: str
@@ -99,6 +115,7 @@ def _looks_of(names: Iterable[str]) -> dict[str, Look]:
     return looks
 
 
+@constructed
 class Looks:
     """The looks of the series of one figure, of which no two are the same.
 
@@ -106,8 +123,11 @@ class Looks:
     that share all three, one strategy at several tolerances, get ranks in their order.
     """
 
-    def __init__(self, series: Iterable[Series]) -> None:
-        given = list(dict.fromkeys(series))
+    def __init__(self, series: Collection[Series] | Iterator[Series]) -> None:
+        given = list(series)
+        for one in given:
+            refuse_others("a series of Looks", one, rule_of(Series))
+        given = list(dict.fromkeys(given))
         looks, alike = _looks_of(one.name for one in given), defaultdict[Look, list[Series]](list)
         ways = list(dict.fromkeys(sorted(one.way for one in given)))
         dashes = {way: _dashes(way, ways) for way in ways}
@@ -130,12 +150,13 @@ def _dashes(way: str, ways: Sequence[str]) -> Any:
     return usual[way] if way in usual else more[others.index(way) % len(more)]
 
 
+@constructed
 @dataclass(frozen=True)
 class Layout:
     """Size of a panel in inches, and the panels that have room for a colour bar right of them."""
 
-    width: float
-    height: float
+    width: Positive
+    height: Positive
     bars: Literal["none", "every", "last"] = "none"
 
 
@@ -171,6 +192,7 @@ def first_sentence(text: str) -> str:
     return found[0] if found else text
 
 
+@bordered
 class Sheet:
     """A figure of equal panels with a title above and one legend below them all.
 
@@ -189,8 +211,8 @@ class Sheet:
     """
 
     def __init__(
-        self, rows: int, columns: int, title: str = "", layout: Layout = Layout(3.1, 2.5), sharex: Share = "none",
-        sharey: Share = "none",
+        self, rows: AtLeastOne, columns: AtLeastOne, title: str = "", layout: Layout = Layout(3.1, 2.5),
+        sharex: Share = "none", sharey: Share = "none",
     ) -> None:  # fmt: skip
         self._rows, self._columns, self._title, self._layout = rows, columns, title, layout
         self.figure = CaptionedFigure()
@@ -202,7 +224,7 @@ class Sheet:
             panel.tick_params(labelbottom=True, labelleft=True)
 
     @classmethod
-    def with_panels(cls, count: int, title: str, layout: Layout = Layout(3.1, 2.5), share: Share = "none") -> Sheet:
+    def with_panels(cls, count: Count, title: str, layout: Layout = Layout(3.1, 2.5), share: Share = "none") -> Sheet:
         """A sheet with at least `count` panels, at most three in a row; those beyond `count` are not shown."""
         columns = max(1, min(count, 3))
         sheet = cls(-(-count // columns) or 1, columns, title, layout, share, share)
@@ -210,8 +232,10 @@ class Sheet:
             panel.set_axis_off()
         return sheet
 
-    def panel(self, row: int, column: int) -> Axes:
+    def panel(self, row: Count, column: Count) -> Axes:
         """One panel."""
+        if not (row < self._rows and column < self._columns):
+            raise RequestError(f"there is no panel ({row}, {column}) among {self._rows}×{self._columns}")
         return self.panels[row * self._columns + column]
 
     def label_ends(self, panel: Axes) -> None:
@@ -259,12 +283,12 @@ class Sheet:
         return 0.19 * math.ceil(len(named) / columns) + 0.12
 
 
-def plot(axes: Axes, x: Any, y: Any, look: Look, label: str | None = None, **more: Any) -> None:
+def plot(axes: Axes, x: Points, y: Points, look: Look, label: str | None = None, **more: Any) -> None:
     """Draw a line in a look."""
     axes.plot(x, y, label=_legend_label(label), **look.line(len(x)) | more)
 
 
-def scatter(axes: Axes, x: Any, y: Any, look: Look, label: str | None = None, **more: Any) -> None:
+def scatter(axes: Axes, x: Points, y: Points, look: Look, label: str | None = None, **more: Any) -> None:
     """Draw points in a look."""
     axes.plot(x, y, label=_legend_label(label), **look.point() | more)
 
@@ -348,11 +372,12 @@ def styled() -> AbstractContextManager[None]:
     return mpl.rc_context(_style())
 
 
-def save(figure: Figure, folder: Path, name: str, formats: Iterable[str] = ("png", "svg")) -> list[Path]:
+def save(figure: Figure, folder: Path, name: str, formats: Formats = ("png", "svg")) -> list[Path]:
     """Write a figure in every format, "png", "svg" or "pdf"; returns the files."""
     files = {form: folder / f"{name}.{form}" for form in formats}
     for form, file in files.items():
-        write_figure(figure, file, form)
+        with writing(file):
+            write_figure(figure, file, form)
     return list(files.values())
 
 
