@@ -111,7 +111,8 @@ class DualProgramModel(PhasesModel):
         # Smaller than in a section, as the Hessian is the identity in any case: two or three steps.
         _, sigma = proximal_factor(Y, 1e-6)
         vertices = np.divide(lengths, self._gauges, out=np.zeros(R), where=self._gauges > 0.0)
-        energy = float(vertices.max(initial=0.0))
+        # Of a cone ζ has no part: a price of 1 holds it at zero.
+        energy = float(vertices.max(initial=0.0)) or 1.0
         shared = np.append(self._gauges * energy, 1.0)
         rows = np.column_stack([np.vstack([Y.T, 0.0 * load]), np.vstack([np.eye(R), np.zeros(R)]), -shared])
         rows[:, -1 - R : -1] *= np.sqrt(sigma)
@@ -122,7 +123,7 @@ class DualProgramModel(PhasesModel):
             found = solved_step(settings, VariationalInequality(identity, f, rows, bounds))
             return found, last if found.x is None or found.alpha is None else np.append(found.alpha[:R], found.x[-1])
 
-        return proximal(step, Y, np.append(np.full(R, sigma), 1.0 / (energy or 1.0)), settings.accuracy, 30)
+        return proximal(step, Y, np.append(np.full(R, sigma), 1.0 / energy), settings.accuracy, 30)
 
     def coordinates(self, mu: Array, answer: FormulationAnswer) -> tuple[Any, Array, Array]:
         """The reduced problem, x = A⁻¹(f − Bᵀα), and α on the generators of `reduced`: free ones have both signs.
