@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import contextlib
 import locale
 import os
@@ -16,6 +15,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -45,7 +45,12 @@ def _parts() -> dict[str, tuple[Callable[[], Any], Callable[[Any], object]]]:
     owned = {sys: ("path", "meta_path", "path_hooks", "stdin", "stdout", "stderr"), warnings: ("filters",)}
     return {
         "the recursion limit": (sys.getrecursionlimit, sys.setrecursionlimit),
-        "builtins": (builtins.__dict__.copy, builtins.__dict__.update),
+        **{
+            # A function that a plugin replaces there makes the numbers of others wrong in silence.
+            module.__name__: (partial(_functions, module), vars(module).update)
+            for module in map(sys.modules.get, ("builtins", "time", "numpy", "numpy.linalg", "scipy.linalg"))
+            if module is not None
+        },
         "sys.settrace": (sys.gettrace, sys.settrace), "sys.setprofile": (sys.getprofile, sys.setprofile),
         **{
             f"{owner.__name__}.{name}": (partial(_copy, owner, name), partial(setattr, owner, name))
@@ -69,6 +74,11 @@ def _parts() -> dict[str, tuple[Callable[[], Any], Callable[[Any], object]]]:
         **{f"the timer {one}": (partial(_ends, one), partial(_set_timer, one)) for one in range(3)},
         "the locale": (partial(locale.setlocale, locale.LC_ALL), partial(locale.setlocale, locale.LC_ALL)),
     }  # fmt: skip
+
+
+def _functions(module: ModuleType) -> dict[str, Any]:
+    # Submodules are added as they are imported.
+    return {name: one for name, one in vars(module).items() if callable(one)}
 
 
 def _copy(owner: Any, name: str) -> Any:

@@ -6,12 +6,14 @@ import resource
 import signal
 import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 from vibench.process import put_back
 
@@ -40,6 +42,10 @@ ACTS: dict[str, tuple[Callable[[], Any], Callable[[], Any]]] = {
         lambda: signal.signal(signal.SIGUSR1, signal.SIG_IGN), lambda: signal.getsignal(signal.SIGUSR1)
     ),
     "the timer 1": (lambda: signal.setitimer(signal.ITIMER_VIRTUAL, 1e3), lambda: signal.getitimer(1)),
+    "time": (lambda: setattr(time, "process_time", float), lambda: time.process_time),
+    "numpy": (lambda: setattr(np, "argmax", np.argmin), lambda: np.argmax),
+    "numpy.linalg": (lambda: setattr(np.linalg, "norm", np.size), lambda: np.linalg.norm),
+    "scipy.linalg": (lambda: setattr(scipy.linalg, "cholesky", np.zeros_like), lambda: scipy.linalg.cholesky),
     "numpy.seterr": (lambda: np.seterr(all="raise"), np.geterr),
 }  # fmt: skip
 
