@@ -97,7 +97,8 @@ NOT_CALLED = {
 }
 # Numbers that a figure leaves out, the infinite ones of nothing known; any index; no models; styles of lines, texts.
 PARTLY_RIGHT = {
-    "Data.interval.bounds", "Decisions.models", "LazyDistances.widen.taken", "Look.dashes", "Looks.series", "Prior.sd", "Series.variant",
+    "Data.interval.bounds", "Decisions.models", "LazyDistances.widen.taken", "Look.dashes", "Looks.series", "Prior.sd",
+    "Series.variant",
     "constraint_classes.matrices", "plot.x", "plot.y", "scatter.x", "scatter.y", "save.formats",
 }  # fmt: skip
 
