@@ -41,6 +41,8 @@ def _are_numbers(value: Any) -> bool:
     return kind in set("fiub") and np.ndim(value) == 1
 
 
+# Names in files of others have any characters.
+Text = Annotated[Any, Rule("a text", lambda value: isinstance(value, str))]
 Points = Annotated[Any, Rule("numbers of points", _are_numbers), "k"]
 Formats = Annotated[Collection[str], Rule("formats of png, svg and pdf", {"png", "svg", "pdf"}.issuperset)]
 Share = Literal["none", "all", "row", "col"]
@@ -83,9 +85,9 @@ HIGH_FIDELITY_LOOK = Look("#000000", "s", 0)
 class Series:
     """A series of a figure: name of its strategy or solver, variant such as a tolerance, and `way` of its queries."""
 
-    name: str
-    variant: str | float = ""
-    way: str = ""
+    name: Text
+    variant: Text | float = ""
+    way: Text = ""
 
 
 def look_of(name: str) -> Look:
@@ -211,7 +213,7 @@ class Sheet:
     """
 
     def __init__(
-        self, rows: AtLeastOne, columns: AtLeastOne, title: str = "", layout: Layout = Layout(3.1, 2.5),
+        self, rows: AtLeastOne, columns: AtLeastOne, title: Text = "", layout: Layout = Layout(3.1, 2.5),
         sharex: Share = "none", sharey: Share = "none",
     ) -> None:  # fmt: skip
         self._rows, self._columns, self._title, self._layout = rows, columns, title, layout
@@ -224,7 +226,7 @@ class Sheet:
             panel.tick_params(labelbottom=True, labelleft=True)
 
     @classmethod
-    def with_panels(cls, count: Count, title: str, layout: Layout = Layout(3.1, 2.5), share: Share = "none") -> Sheet:
+    def with_panels(cls, count: Count, title: Text, layout: Layout = Layout(3.1, 2.5), share: Share = "none") -> Sheet:
         """A sheet with at least `count` panels, at most three in a row; those beyond `count` are not shown."""
         columns = max(1, min(count, 3))
         sheet = cls(-(-count // columns) or 1, columns, title, layout, share, share)
@@ -242,7 +244,7 @@ class Sheet:
         """Name the lines, or points, of a panel right of it, at most five, in place of the legend."""
         self._labelled_ends.append(panel)
 
-    def finish(self, caption: str = "", part: str = "") -> CaptionedFigure:
+    def finish(self, caption: Text = "", part: Text = "") -> CaptionedFigure:
         """Set ticks, sizes and a legend in which every label of the panels occurs once; returns the figure.
 
         The caption says, too, what it leaves out (`part`).
