@@ -325,9 +325,13 @@ class Decisions:
             elif self._models:
                 self._query(mu, known)
             if key in self.answers:
-                known.lower = known.upper = self.answers[key][0]
-                known.level = len(self._models) + 1
+                self._settle(known, self.answers[key][0])
         return self._recent[key]
+
+    def _settle(self, known: Interval, misfit: float) -> None:
+        """Close an interval at the misfit of the high-fidelity model."""
+        known.lower = known.upper = misfit
+        known.level = len(self._models) + 1
 
     def _query(self, mu: Array, known: Interval) -> None:
         """Narrow an interval by the next model."""
@@ -352,8 +356,7 @@ class Decisions:
                 found = f"the high-fidelity misfit {misfit:.6g} is not between {known.lower:.6g} and {known.upper:.6g}"
                 raise RefutedError(f"the bounds are refuted at mu = {mu.tolist()}: {found}")
             self.answers[key] = misfit, seconds
-            known.lower = known.upper = misfit
-            known.level = len(self._models) + 1
+            self._settle(known, misfit)
         return self.answers[key][0]
 
     def _solved(self, mu: Array) -> tuple[float, float]:

@@ -66,6 +66,11 @@ def chain(noise: float, steps: int, *models: Callable[[np.ndarray], Prediction],
     return made
 
 
+def with_covariance(root: np.ndarray) -> Data:
+    covariance = root @ root.T + 0.1 * np.eye(3)
+    return Data(NAMES, np.array([1.0, 2.0, 3.0]), 0.5 * (covariance + covariance.T))
+
+
 @cache
 def exact_chain(noise: float) -> Metropolis:
     """That of the high-fidelity model."""
@@ -79,8 +84,7 @@ def exact_chain(noise: float) -> Metropolis:
 def test_the_misfit_of_outputs_within_their_bounds_is_in_the_interval(
     outputs: np.ndarray, share: np.ndarray, bounds: np.ndarray, root: np.ndarray
 ) -> None:
-    covariance = root @ root.T + 0.1 * np.eye(3)
-    measured = Data(NAMES, np.array([1.0, 2.0, 3.0]), 0.5 * (covariance + covariance.T))
+    measured = with_covariance(root)
     low, high = measured.interval(outputs, bounds)
     apart = outputs + share * bounds - measured.values
     misfit = 0.5 * apart @ np.linalg.solve(measured.covariance, apart)
@@ -117,8 +121,7 @@ def test_chains_by_bounds_are_those_of_the_high_fidelity_model(noise: float) -> 
 def test_the_misfit_of_outputs_with_correlated_errors_is_in_the_interval(
     outputs: np.ndarray, root: np.ndarray, functionals: np.ndarray, error: np.ndarray
 ) -> None:
-    covariance = root @ root.T + 0.1 * np.eye(3)
-    measured = Data(NAMES, np.array([1.0, 2.0, 3.0]), 0.5 * (covariance + covariance.T))
+    measured = with_covariance(root)
     functionals = functionals + 1e-3 * np.eye(3, 4)
     norms = np.linalg.norm(functionals, axis=1)
     bounds, correlation = norms * np.linalg.norm(error), functionals @ functionals.T / np.outer(norms, norms)
