@@ -40,7 +40,7 @@ those of the high-fidelity chain at the mean of the questions. Proposals outside
 def data_of(problem: vibench.Problem, truth: tuple[float, ...], noise: float) -> Data:
     """Synthetic data of all linear outputs."""
     names = tuple(output.name for output in problem.outputs if output.linear)
-    return synthetic(names, Sensors(problem, names).high_fidelity()(np.array(truth)), noise, SEED)
+    return synthetic(names, Sensors(problem, names)(np.array(truth)), noise, SEED)
 
 
 def chain_of(decisions: Decisions, problem: vibench.Problem) -> tuple[Metropolis, float]:

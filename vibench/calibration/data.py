@@ -22,13 +22,10 @@ from vibench.interfaces.problem import Problem
 from vibench.signatures import Rule, bordered, inside, is_plain
 from vibench.study.matrix import read_toml
 
-
-def _is_size(value: Any) -> bool:
-    return is_plain(value) and value.dtype.kind in "fiu" and bool((value >= 0.0).all())
-
-
 # Infinite where nothing is known.
-Sizes = Annotated[Any, Rule("an array of numbers of at least 0", _is_size)]
+Sizes = Annotated[
+    Any, Rule("an array of numbers of at least 0", lambda a: is_plain(a) and a.dtype.kind in "fiu" and (a >= 0.0).all())
+]
 
 
 class _Table(BaseModel):
@@ -161,19 +158,20 @@ def read_data(path: Path, problem: Problem) -> tuple[Data, Prior]:
             file = _File.model_validate(content)
         except ValidationError as fault:
             raise RequestError(fault_line(fault, _File)) from None
-        values = [sensor.value for sensor in file.sensors.values()]
-        for output, sensor in zip(outputs_of(problem, [*file.sensors]), file.sensors.values(), strict=True):
+        names, sensors, count = tuple(file.sensors), file.sensors.values(), len(file.sensors)
+        for output, sensor in zip(outputs_of(problem, names), sensors, strict=True):
             if sensor.unit not in (None, output.unit):
                 raise RequestError(f"sensors.{output.name}.unit is '{sensor.unit}', the output has '{output.unit}'")
         prior = Prior.of(problem.parameters, {name: (one.mean, one.sd) for name, one in file.prior.items()})
-        if file.covariance is None:
-            noise = np.array([_deviation(name, sensor) for name, sensor in file.sensors.items()])
-            return Data.independent(tuple(file.sensors), np.array(values), noise), prior
-        if [len(row) for row in file.covariance] != [len(values)] * len(values):
-            raise RequestError(f"covariance has not the shape ({len(values)}, {len(values)}) of the sensors")
-        if twice := [name for name, sensor in file.sensors.items() if sensor.noise is not None]:
-            raise RequestError(f"sensors.{twice[0]}.noise: with a covariance the sensors have no noise of their own")
-        return Data(tuple(file.sensors), np.array(values), np.array(file.covariance, float)), prior
+        values = np.array([sensor.value for sensor in sensors])
+        if (covariance := file.covariance) is None:
+            return Data.independent(names, values, np.array(list(map(_deviation, names, sensors)))), prior
+        if [len(row) for row in covariance] != [count] * count:
+            raise RequestError(f"covariance has not the shape ({count}, {count}) of the sensors")
+        for name, sensor in file.sensors.items():
+            if sensor.noise is not None:
+                raise RequestError(f"sensors.{name}.noise: with a covariance the sensors have no noise of their own")
+        return Data(names, values, np.array(covariance, float)), prior
 
 
 def _deviation(name: str, sensor: _Sensor) -> float:

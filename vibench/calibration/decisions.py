@@ -44,6 +44,7 @@ from vibench.arrays import Array, SparseMatrix, is_sound
 from vibench.calibration.data import Data, outputs_of
 from vibench.errors import NumericalError, RequestError, UnsupportedError
 from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.dual_sets import DualSet
 from vibench.interfaces.formulations import FormulationAnswer
 from vibench.interfaces.parameters import ParameterBox, outside
 from vibench.interfaces.problem import Problem
@@ -90,29 +91,30 @@ Predict = Callable[[Array], Prediction]
 
 
 class Sensors:
-    """Linear outputs of a problem by their names; a `RequestError` if there is no such output.
+    """Linear outputs of high-fidelity solutions, by their names; a `RequestError` if there is no such output.
 
-    High-fidelity solutions are as accurate as bounds allow for: their natural residuals are at most `accuracy`.
+    Solutions are as accurate as bounds allow for: their natural residuals are at most `accuracy`.
     """
 
     # A hundredth of what is verified elsewhere, and a hundred times what is usual: bounds grow by twice its root.
     accuracy = 1e-12
 
     def __init__(self, problem: Problem, names: tuple[str, ...]) -> None:
-        self.problem, self.outputs = problem, outputs_of(problem, names)
+        self.outputs, self._solver = outputs_of(problem, names), HighFidelitySolver(problem)
 
-    def high_fidelity(self) -> Callable[[Array], Array]:
-        """From mu (d,) to the outputs (k,) of the high-fidelity solution; a `NumericalError` if it is less accurate."""
-        solver = HighFidelitySolver(self.problem)
+    def __call__(self, mu: Array) -> Array:
+        """The outputs (k,) at mu (d,); a `NumericalError` if the solution is less accurate."""
+        found = self._solver.solve(mu)
+        if not found.residuals.worst <= self.accuracy:
+            left = f"{found.residuals.worst:.1e} at mu = {mu.tolist()}, above {self.accuracy:.0e}"
+            raise NumericalError(f"the high-fidelity solution has the natural residual {left}")
+        return np.array([one.values(mu[None], found.u[:, None], found.lam[:, None])[0] for one in self.outputs])
 
-        def ask(mu: Array) -> Array:
-            found = solver.solve(mu)
-            if not found.residuals.worst <= self.accuracy:
-                left = f"{found.residuals.worst:.1e} at mu = {mu.tolist()}, above {self.accuracy:.0e}"
-                raise NumericalError(f"the high-fidelity solution has the natural residual {left}")
-            return np.array([one.values(mu[None], found.u[:, None], found.lam[:, None])[0] for one in self.outputs])
 
-        return ask
+def refuse_bounded(K: DualSet) -> None:
+    """Raise a `RequestError` where multipliers are bounded: the accuracy above is derived for λ ≥ 0 alone."""
+    if K.blocks:
+        raise RequestError(f"λ has no bound, which the accuracy of solutions needs: no beta_A, as K has {K.names()}")
 
 
 @constructed
@@ -126,6 +128,7 @@ class BoundedSensors:
         problem, outputs = model.problem, outputs_of(model.problem, names)
         if model.certificate is None:
             raise RequestError("the model has no error bounds: a calibration needs one with bounds = true")
+        refuse_bounded(problem.K)
         self.model, self.certificate, self.base = model, model.certificate, model.certificate.base
         share = share_of_diagonal(problem.W)
         if not (self.base.inf_sup.value > 0.0 and share.proved and share.value > 0.0):
@@ -260,7 +263,7 @@ class Interval:
     upper: float
     # The misfit of the reduced model, by which decisions without bounds are taken.
     middle: float
-    # Number of the models that were queried, one more once the high-fidelity model was asked.
+    # Number of the models that were queried, the high-fidelity model among them.
     level: int
 
     def below(self, other: Interval, shift: float) -> bool | None:
@@ -274,12 +277,12 @@ class Interval:
 class Counts:
     """Decisions, those that bounds left open, audits, decisions that the reduced model takes wrongly without bounds."""
 
-    decisions: int
-    undecided: int
-    audits: int
-    wrong: int
+    decisions: int = 0
+    undecided: int = 0
+    audits: int = 0
+    wrong: int = 0
     # CPU seconds of the reduced model.
-    model_seconds: float
+    model_seconds: float = 0.0
 
 
 @bordered
@@ -292,7 +295,7 @@ class Decisions:
         The problem, and the data that its outputs are compared with.
     models
         Outputs with bounds, as of `BoundedSensors`, from the quickest model to the most accurate one: each is queried
-        where those before it leave a decision open. Without models the high-fidelity model is asked always.
+        where those before it leave a decision open, and the high-fidelity model where all of them do.
     audit
         Share of the decided decisions, drawn at random, for which the high-fidelity model is asked all the same.
     seed
@@ -305,9 +308,9 @@ class Decisions:
         self, problem: Problem, data: Data, models: Sequence[Predict],
         audit: Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)], seed: Seed,
     ) -> None:  # fmt: skip
-        self.data, self.counts, self.guarantee = data, Counts(0, 0, 0, 0, 0.0), Guarantee.CERTIFIED
+        self.data, self.counts, self.guarantee = data, Counts(), Guarantee.CERTIFIED
         self._box, self._models, self._audit = problem.parameters, tuple(models), audit
-        self._ask, self._random = Sensors(problem, data.sensors).high_fidelity(), np.random.default_rng(seed)
+        self._solve, self._random = Sensors(problem, data.sensors), np.random.default_rng(seed)
         # Misfit and CPU seconds of the high-fidelity model by the bytes of the parameter: all that were asked, and
         # those that an interrupted run has asked before.
         self.answers: dict[bytes, tuple[float, float]] = {}
@@ -323,71 +326,62 @@ class Decisions:
             if outside(self._box, mu).any():
                 known.level = len(self._models)
             elif self._models:
-                self._query(mu, known)
+                self._narrow(mu, known)
             if key in self.answers:
-                self._settle(known, self.answers[key][0])
+                inside(self.ask)(mu)
         return self._recent[key]
 
-    def _settle(self, known: Interval, misfit: float) -> None:
-        """Close an interval at the misfit of the high-fidelity model."""
-        known.lower = known.upper = misfit
-        known.level = len(self._models) + 1
-
-    def _query(self, mu: Array, known: Interval) -> None:
-        """Narrow an interval by the next model."""
-        predict = self._models[known.level]
-        (outputs, bounds, guarantee, correlation), seconds = timed(lambda: predict(mu))
-        self.counts.model_seconds += seconds.cpu
-        if guarantee is not Guarantee.CERTIFIED:
-            self.guarantee = Guarantee.VERIFIED
-        lower, upper = inside(self.data.interval)(outputs, bounds, correlation)
-        if lower > known.upper or upper < known.lower:
-            both = f"{known.lower:.6g} to {known.upper:.6g} by one model, {lower:.6g} to {upper:.6g} by another one"
+    def _narrow(self, mu: Array, known: Interval) -> None:
+        """Narrow an interval by the next model, of which the high-fidelity model is the last; its answers are kept."""
+        if known.level < len(self._models):
+            (outputs, bounds, guarantee, correlation), spent = timed(lambda: self._models[known.level](mu))
+            self.counts.model_seconds += spent.cpu
+            if guarantee is not Guarantee.CERTIFIED:
+                self.guarantee = Guarantee.VERIFIED
+            lower, upper = inside(self.data.interval)(outputs, bounds, correlation)
+            known.middle, by = inside(self.data.misfit)(outputs), "another model"
+        else:
+            if (key := mu.tobytes()) not in self.answers:
+                self.answers[key] = self.earlier.get(key) or self._solved(mu)
+            lower = upper = self.answers[key][0]
+            by = "the high-fidelity model"
+        if not (lower <= known.upper and upper >= known.lower):
+            both = f"{known.lower:.6g} to {known.upper:.6g}, and {lower:.6g} to {upper:.6g} by {by}"
             raise RefutedError(f"the bounds are refuted at mu = {mu.tolist()}: the misfit is {both}")
-        known.lower, known.upper = max(lower, known.lower), min(upper, known.upper)
-        known.middle, known.level = inside(self.data.misfit)(outputs), known.level + 1
+        known.lower, known.upper, known.level = max(lower, known.lower), min(upper, known.upper), known.level + 1
+
+    def _solved(self, mu: Array) -> tuple[float, float]:
+        outputs, spent = timed(lambda: self._solve(mu))
+        return self.data.misfit(outputs), spent.cpu
 
     def ask(self, mu: Annotated[Array, "d"]) -> float:
         """The misfit of the high-fidelity model at mu (d,), which is kept; a `RefutedError` if bounds exclude it."""
-        key, known = mu.tobytes(), inside(self.interval)(mu)
-        if key not in self.answers:
-            misfit, seconds = self.earlier[key] if key in self.earlier else self._solved(mu)
-            if not known.lower <= misfit <= known.upper:
-                found = f"the high-fidelity misfit {misfit:.6g} is not between {known.lower:.6g} and {known.upper:.6g}"
-                raise RefutedError(f"the bounds are refuted at mu = {mu.tolist()}: {found}")
-            self.answers[key] = misfit, seconds
-            self._settle(known, misfit)
-        return self.answers[key][0]
-
-    def _solved(self, mu: Array) -> tuple[float, float]:
-        outputs, seconds = timed(lambda: self._ask(mu))
-        return self.data.misfit(outputs), seconds.cpu
+        known = inside(self.interval)(mu)
+        if known.level <= len(self._models):
+            known.level = len(self._models)
+            self._narrow(mu, known)
+        return known.lower
 
     def less(self, a: Annotated[Array, "d"], b: Annotated[Array, "d"], shift: float = 0.0) -> bool:
         """Whether the high-fidelity misfit at a (d,) is less than that at b (d,) plus a shift.
 
         Raises a `RefutedError` if an answer of the high-fidelity model contradicts the bounds.
         """
-        interval, ask = inside(self.interval), inside(self.ask)
-        one, other = interval(a), interval(b)
-        verdict = one.below(other, shift)
-        self.counts.decisions += 1
-        # Later decisions compare with b again, the present state of a chain: it is queried and asked first.
-        while verdict is None and min(one.level, other.level) < len(self._models):
-            self._query(*((b, other) if other.level <= one.level else (a, one)))
-            verdict = one.below(other, shift)
-        if verdict is None:
-            self.counts.undecided += 1
-            for mu in (b, a):
-                ask(mu)
-                if (verdict := one.below(other, shift)) is not None:
-                    break
-        elif self._models and self._random.random() < self._audit:
+        one, other = map(inside(self.interval), (a, b))
+        is_open = False
+        while (verdict := one.below(other, shift)) is None:
+            # Later decisions compare with b again, the present state of a chain: it is queried and asked first.
+            mu, known = (b, other) if other.level <= one.level else (a, one)
+            is_open = is_open or known.level == len(self._models)
+            self._narrow(mu, known)
+        if not is_open and self._models and self._random.random() < self._audit:
             self.counts.audits += 1
-            ask(a)
-            ask(b)
+            for mu in (a, b):
+                inside(self.ask)(mu)
+        self.counts.decisions += 1
+        self.counts.undecided += is_open
         self.counts.wrong += bool(self._models and (one.middle < other.middle + shift) != verdict)
-        return bool(verdict)
+        return verdict
 
     @property
     def seconds(self) -> float:

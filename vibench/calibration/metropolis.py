@@ -112,12 +112,12 @@ def draw(chain: Metropolis, file: Path) -> None:
 
     box, states = chain.prior.box, chain.states
     figure = Figure(figsize=(3.2 * box.dim, 4.6), layout="constrained")
-    for column, (name, unit) in enumerate(zip(box.names, box.units, strict=True)):
-        top, below = (figure.add_subplot(2, box.dim, row * box.dim + column + 1) for row in range(2))
-        top.hist(states[chain.burn_in + 1 :, column], bins=40, density=True, color="tab:blue")
-        below.plot(states[:, column], linewidth=0.5, color="tab:blue")
+    panels = figure.subplots(2, box.dim, squeeze=False).T
+    for (top, below), name, unit, values in zip(panels, box.names, box.units, states.T, strict=True):
+        top.hist(values[chain.burn_in + 1 :], bins=40, density=True)
+        below.plot(values, linewidth=0.5)
         below.axvspan(0, chain.burn_in, color="0.9")
         label = name.replace("_", " ") + (f" [{unit}]" if unit != "1" else "")
-        top.set(xlabel=label, yticks=[], ylabel="density" if column == 0 else "")
+        top.set(xlabel=label, ylabel="density", yticks=[])
         below.set(xlabel="step (grey: burn-in)", ylabel=label)
     figure.savefig(file, dpi=150)

@@ -13,6 +13,7 @@ from typer import Argument, Exit, Option
 from vibench.cli.completion import problems
 from vibench.cli.console import echo, print_frame
 from vibench.cli.plugin_commands import key_value
+from vibench.cli.result_commands import components
 from vibench.errors import RequestError, message_of, placed
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def calibrate(
     asked. Ctrl-C keeps its answers, and the same command continues with them.
     """
     from vibench.calibration.data import outputs_of, read_data, refuse_unreachable, share
-    from vibench.calibration.decisions import Decisions, quickest_sensors
+    from vibench.calibration.decisions import Decisions, quickest_sensors, refuse_bounded
     from vibench.calibration.metropolis import Metropolis, arviz
     from vibench.execution.recorded_cell import cell_model, recorded_cell
     from vibench.stages.base import build_problem
@@ -54,6 +55,8 @@ def calibrate(
     recorded = recorded_cell(problem, cell) if cell else None
     chosen = _trained_cell(problem, option) if recorded is None else recorded.cell
     target = build_problem(chosen.problem)
+    with placed(str(data)):
+        refuse_bounded(target.K)
     if synthetic:
         _write_synthetic(target, synthetic, share(noise), data, seed)
     measured, prior = read_data(data, target)
@@ -75,24 +78,16 @@ def calibrate(
 
 
 def _trained_cell(problem: str, option: list[str] | None) -> Cell:
-    """The cell of the study `calibration` for a problem of the command line, with the defaults for its dual set."""
+    """The first cell of the study `calibration` for a problem of the command line."""
     from vibench.cli.run_command import problem_entry
-    from vibench.plugins.kinds import PluginKind
-    from vibench.plugins.registry import default_of
     from vibench.study.matrix import expand, read_study
-    from vibench.study.parameter_sets import blocks_of
 
     entry = problem_entry(problem)
     if option:
         if not isinstance(entry, str):
             raise RequestError("--option is for a problem by its name; a class or a pack has its own")
         entry = {"name": entry, "options": dict(map(key_value, option))}
-    cell = expand(read_study("calibration", {"problem": [entry]}))[0]
-    if not (blocks := blocks_of(cell.problem)):
-        return cell
-    kinds = {"formulation": PluginKind.FORMULATION, "dual": PluginKind.DUAL}
-    named = {key: [default_of(kind, blocks)] for key, kind in kinds.items()}
-    return expand(read_study("calibration", {"problem": [entry], **named}))[0]
+    return expand(read_study("calibration", {"problem": [entry]}))[0]
 
 
 def _write_synthetic(problem: Problem, mu: str, noise: float, file: Path, seed: int) -> None:
@@ -102,14 +97,11 @@ def _write_synthetic(problem: Problem, mu: str, noise: float, file: Path, seed: 
     from vibench.files import write_atomically, writing
     from vibench.offline.models import parameter_in
 
-    try:
-        at = parameter_in(problem.parameters, [float(each) for each in mu.split(",")])
-    except ValueError:
-        raise RequestError(f"--synthetic is {mu!r}, expected numbers separated by commas, such as 1.2,0.05") from None
+    at = parameter_in(problem.parameters, components("--synthetic", mu))
     sensors = Sensors(problem, names := tuple(output.name for output in problem.outputs if output.linear))
     if not names:
         raise RequestError("the problem has no linear outputs, which sensors have to be")
-    text = as_toml(synthetic(names, sensors.high_fidelity()(at), noise, seed), sensors.outputs)
+    text = as_toml(synthetic(names, sensors(at), noise, seed), sensors.outputs)
     if file.exists() and file.read_text(encoding="utf-8") != text:
         raise RequestError(f"'{file}' exists with other data; leave out --synthetic, or choose another name")
     with writing(file):
@@ -125,7 +117,7 @@ def _walk(chain: Metropolis, steps: int, file: Path, about: str, *, fresh: bool)
     from vibench.files import write_atomically, writing
     from vibench.text import new_console
 
-    decisions, content, console, stopped = chain.decisions, io.BytesIO(), new_console(), False
+    decisions, content, console = chain.decisions, io.BytesIO(), new_console()
     if file.exists() and not fresh:
         with placed(f"'{file}'"):
             decisions.earlier = _answers(file, about, chain.prior.box.dim)
@@ -136,7 +128,8 @@ def _walk(chain: Metropolis, steps: int, file: Path, about: str, *, fresh: bool)
                 chain.step()
     # A step that is left half-way is walked again: a chain that continues starts anew, and knows the answers.
     except KeyboardInterrupt:
-        stopped = True
+        echo(f"interrupted after {chain.steps} of {steps} steps; the same command continues")
+        raise Exit(130) from None
     # What refutes bounds is raised again: the answers up to there are kept, too.
     finally:
         known = decisions.earlier | decisions.answers
@@ -146,9 +139,6 @@ def _walk(chain: Metropolis, steps: int, file: Path, about: str, *, fresh: bool)
         with writing(file):
             file.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(file, content.getvalue())
-    if stopped:
-        echo(f"interrupted after {chain.steps} of {steps} steps; the same command continues")
-        raise Exit(130)
 
 
 def _answers(file: Path, about: str, dim: int) -> dict[bytes, tuple[float, float]]:

@@ -37,6 +37,14 @@ def places_of(at: list[str] | None) -> dict[str, str]:
     return {name: str(Path(path).absolute()) for name, _, path in pairs}
 
 
+def components(option: str, text: str) -> list[float]:
+    """The components of a parameter on the command line."""
+    try:
+        return [float(each) for each in text.split(",")]
+    except ValueError:
+        raise RequestError(f"{option} is {text!r}, expected numbers separated by commas, such as 1.2,0.05") from None
+
+
 RunArgument = Annotated[str, Argument(metavar="RUN", help="A run folder, or its name in runs/.", autocompletion=runs)]
 RunsArgument = Annotated[
     list[str], Argument(metavar="RUN", help="Run folders, results files, or names in runs/.", autocompletion=runs)
@@ -353,12 +361,9 @@ def export(
         from vibench.library.runs import open_run
         from vibench.library.vtu import export_vtu
 
-        try:
-            components = [float(each) for each in mu.split(",")]
-        except ValueError:
-            raise RequestError(f"--mu is {mu!r}, expected numbers separated by commas, such as 1.2,0.05") from None
-        export_vtu(open_run(run, at=places_of(at)).model(cell[0]), components, target)
-        echo(f"u, λ and their errors at mu = {components}: {target}")
+        given = components("--mu", mu)
+        export_vtu(open_run(run, at=places_of(at)).model(cell[0]), given, target)
+        echo(f"u, λ and their errors at mu = {given}: {target}")
     else:
         _export_model(run, cell[0], target, tolerance, bases, places_of(at))
 

@@ -46,7 +46,7 @@ class CalibrationStage(Stage):
             raise NumericalError("the problem has no linear outputs, which sensors have to be")
         unbounded = model.certificate is None
         predict, by = (_unbounded(model, sensors), "model") if unbounded else quickest_sensors(model, sensors)
-        exact = Sensors(problem, sensors).high_fidelity()(box.sample(1, seed)[0])
+        exact = Sensors(problem, sensors)(box.sample(1, seed)[0])
         rows: list[Row] = []
         for noise in (0.03, 0.01, 0.003):
             decisions = Decisions(problem, synthetic(sensors, exact, noise, seed), (predict,), 0.01, seed)

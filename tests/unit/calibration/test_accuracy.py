@@ -51,7 +51,7 @@ def test_the_distance_needs_no_constraint_where_it_is_a_multiple_of_one_matrix()
 
 
 def test_less_accurate_solutions_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    ask = Sensors(Radial("coarse"), NAMES).high_fidelity()
+    ask = Sensors(Radial("coarse"), NAMES)
     monkeypatch.setattr(Sensors, "accuracy", 1e-20)
     with pytest.raises(NumericalError, match=r"has the natural residual .* at mu = \[0\.17, 0\.1\], above 1e-20"):
         ask(np.array([0.17, 0.1]))

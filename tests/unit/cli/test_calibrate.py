@@ -6,6 +6,7 @@ import signal
 import tomllib
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,6 @@ from running import Main, refused
 from vibench.calibration import Metropolis
 from vibench.calibration.data import read_data
 from vibench.calibration.metropolis import arviz
-from vibench.cli.calibrate_command import _trained_cell
 from vibench.errors import RequestError
 from vibench_problems.hertz import Hertz
 from vibench_problems.radial import Radial
@@ -129,23 +129,25 @@ def test_faults_of_a_data_file_are_named(sensors: dict[str, Any], rest: str, sai
     assert "\n" not in str(caught.value)
 
 
-def test_outputs_without_bounds_are_refused_before_a_model_is_trained(
-    main: Main, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("problem", "sensor", "said"),
+    [
+        ("hertz", "contact half-width", "is no linear output, and has no bound; linear: contact force, indentation"),
+        ("tresca", "tangential force", "data.toml: λ has no bound, which the accuracy of solutions needs: no beta_A"),
+    ],
+)
+def test_what_has_no_bound_is_refused_before_a_model_is_trained(
+    problem: str, sensor: str, said: str, main: Main, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vibench.execution.recorded_cell.cell_model", None)
-    Path("data.toml").write_text('[sensors."contact half-width"]\nvalue = 0.1\nnoise = 0.01\n')
-    said = "'contact half-width' is no linear output, and has no bound; linear: contact force, indentation"
-    refused(main("calibrate", "hertz", "data.toml", "--option", "resolution=coarse"), said)
+    training = Mock()
+    monkeypatch.setattr("vibench.execution.recorded_cell.cell_model", training)
+    Path("data.toml").write_text(f'[sensors."{sensor}"]\nvalue = 0.1\nnoise = 0.01\n')
+    refused(main("calibrate", problem, "data.toml", "--option", "resolution=coarse"), said)
+    assert training.call_count == 0
 
 
 def _lines(values: dict[str, Any]) -> str:
     return "".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items())
-
-
-def test_where_multipliers_are_bounded_the_model_is_the_default_of_that_set() -> None:
-    cell = _trained_cell("tresca", ["resolution=coarse"])
-    assert (cell.dual.name, cell.formulation_label) == ("hull-greedy", "dual-program")
-    assert _trained_cell("radial-obstacle", None).dual.name == "mcpg"
 
 
 def test_data_with_a_covariance_and_a_prior_are_read(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def test_a_model_without_bounds_walks_the_high_fidelity_chain_and_its_wrong_deci
     strategies = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
     model = vibench.Reduction(problem, *strategies, vibench.Stop(size=1), vibench.Stop(size=2), 0.5).model
     names = tuple(output.name for output in problem.outputs)
-    exact = Sensors(problem, names).high_fidelity()(np.array([0.17, 0.1]))
+    exact = Sensors(problem, names)(np.array([0.17, 0.1]))
     chains = []
     for models in ((_unbounded(model, names),), ()):
         decisions = Decisions(problem, synthetic(names, exact, 0.01, 1), models, 0.01, 0)
