@@ -19,7 +19,7 @@ from page import Page, made_by, start
 
 import vibench
 from vibench.calibration.data import Data, Prior, synthetic
-from vibench.calibration.decisions import Decisions, Predict, Sensors, quickest_sensors
+from vibench.calibration.decisions import Decisions, Predict, quickest_sensors
 from vibench.calibration.metropolis import Metropolis
 from vibench.timing import Stopwatch
 
@@ -35,12 +35,6 @@ where those before it leave a decision open. Their tolerances of POD and cone ar
 (1e-6, 1e-3) for the obstacle, (1e-3, 1e-2), (1e-5, 1e-3) and (1e-5, 3e-4) for Hertz. The training is that of all
 three, each by itself, with the compilation of their programs. Seconds are CPU seconds on a machine with other load,
 those of the high-fidelity chain at the mean of the questions. Proposals outside the box are no decisions."""
-
-
-def data_of(problem: vibench.Problem, truth: tuple[float, ...], noise: float) -> Data:
-    """Synthetic data of all linear outputs."""
-    names = tuple(output.name for output in problem.outputs if output.linear)
-    return synthetic(names, Sensors(problem, names)(np.array(truth)), noise, SEED)
 
 
 def chain_of(decisions: Decisions, problem: vibench.Problem) -> tuple[Metropolis, float]:
@@ -84,7 +78,7 @@ def compare(folder: Path) -> None:
         predicts: list[Predict] = []
         by, training = "", 0.0
         for noise in NOISES:
-            data = data_of(problem, truth, noise)
+            data = synthetic(problem, np.array(truth), noise, SEED)
             states, seconds, solutions = reference(folder / f"{name}-{100 * noise:g}.npz", problem, data)
             if (name, 100 * noise) in known(folder):
                 continue

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,10 +14,14 @@ import scipy.linalg
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from vibench.arrays import Array
-from vibench.errors import RequestError, fault_line, placed, unknown_name
+from vibench.errors import NumericalError, RequestError, fault_line, placed, unknown_name
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.formulations import Snapshots
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.parameters import ParameterBox, outside
 from vibench.interfaces.problem import Problem
+from vibench.offline.exported import linear_outputs
+from vibench.packs.writer import toml_text
 from vibench.signatures import Rule, bordered, inside, is_plain
 from vibench.study.matrix import read_toml
 
@@ -75,8 +78,7 @@ class Data:
             raise RequestError("the covariance of the noise is not positive definite") from None
         if not np.allclose(self.covariance, self.covariance.T, rtol=1e-12, atol=0.0):
             raise RequestError("the covariance of the noise is not symmetric")
-        whitening = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True)
-        object.__setattr__(self, "_whitening", whitening)
+        object.__setattr__(self, "_whitening", scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True))
 
     @classmethod
     def independent(
@@ -138,16 +140,35 @@ class Prior:
         return -0.5 * float(np.sum(((mu - self.mean) / self.sd) ** 2))
 
 
-def outputs_of(problem: Problem, names: Sequence[str]) -> tuple[Output, ...]:
-    """Linear outputs of a problem by their names; a `RequestError` if there is none, or no bound of its errors."""
-    known = {output.name: output for output in problem.outputs}
-    for name in names:
+def outputs_of(problem: Problem, names: Sequence[str] | None = None) -> tuple[Output, ...]:
+    """Linear outputs of a problem, all or by their names: others have no bound; a `RequestError` if there is none."""
+    if not (known := {output.name: output for output in linear_outputs(problem)}):
+        raise RequestError("the problem has no linear outputs, which sensors have to be")
+    for name in names or ():
         if name not in known:
-            raise unknown_name("output of the problem", name, known)
-        if not known[name].linear:
-            linear = ", ".join(each for each, one in known.items() if one.linear)
-            raise RequestError(f"'{name}' is no linear output, and has no bound; linear: {linear or 'none'}")
-    return tuple(known[name] for name in names)
+            raise unknown_name("linear output of the problem", name, known)
+    return tuple(known[name] for name in names or known)
+
+
+class Sensors:
+    """Linear outputs of high-fidelity solutions, by their names.
+
+    Solutions are as accurate as bounds allow for: their natural residuals are at most `accuracy`.
+    """
+
+    # A hundredth of what is verified elsewhere, and a hundred times what is usual: bounds grow by twice its root.
+    accuracy = 1e-12
+
+    def __init__(self, problem: Problem, names: Sequence[str]) -> None:
+        self._outputs, self._solver = outputs_of(problem, names), HighFidelitySolver(problem)
+
+    def __call__(self, mu: Array) -> Array:
+        """The outputs (k,) at mu (d,); a `NumericalError` if the solution is less accurate."""
+        found = self._solver.solve(mu)
+        if not found.residuals.worst <= self.accuracy:
+            left = f"{found.residuals.worst:.1e} at mu = {mu.tolist()}, above {self.accuracy:.0e}"
+            raise NumericalError(f"the high-fidelity solution has the natural residual {left}")
+        return np.array([one.values(mu[None], found.u[:, None], found.lam[:, None])[0] for one in self._outputs])
 
 
 def read_data(path: Path, problem: Problem) -> tuple[Data, Prior]:
@@ -192,29 +213,33 @@ def share(text: str) -> float:
     return float(found[1]) / 100.0
 
 
-def synthetic(sensors: Sequence[str], exact: Array, noise: float, seed: int) -> Data:
-    """Exact values (k,) with random errors, whose deviations are a share of these values."""
+def synthetic(problem: Problem, mu: Array, noise: float, seed: int) -> Data:
+    """All linear outputs at mu (d,) with random errors, whose deviations are a share of their values."""
+    names = tuple(output.name for output in outputs_of(problem))
+    exact = Sensors(problem, names)(mu)
     deviations = noise * np.abs(exact)
-    values = exact + deviations * np.random.default_rng(seed).standard_normal(len(exact))
-    return Data.independent(sensors, values, deviations)
+    errors = np.random.default_rng(seed).standard_normal(len(exact))
+    return Data.independent(names, exact + deviations * errors, deviations)
 
 
-def as_toml(data: Data, outputs: Sequence[Output]) -> str:
-    """The file of data with independent errors, of these outputs."""
+def as_toml(data: Data, problem: Problem) -> str:
+    """The file of data with independent errors."""
+    outputs, deviations = outputs_of(problem, data.sensors), np.sqrt(np.diag(data.covariance))
     lines = []
-    for output, value, square in zip(outputs, data.values.tolist(), np.diag(data.covariance).tolist(), strict=True):
-        name, unit = (json.dumps(text, ensure_ascii=False) for text in (output.name, output.unit))
-        lines += [f"[sensors.{name}]", f"value = {value!r}", f"noise = {square**0.5!r}", f"unit = {unit}", ""]
+    for output, value, deviation in zip(outputs, data.values.tolist(), deviations.tolist(), strict=True):
+        name, unit = map(toml_text, (output.name, output.unit))
+        lines += [f"[sensors.{name}]", f"value = {value!r}", f"noise = {deviation!r}", f"unit = {unit}", ""]
     return "\n".join(lines)
 
 
-def refuse_unreachable(data: Data, reached: Sequence[Array]) -> None:
-    """Raise a `RequestError` for a value far from all that its sensor has at training parameters, `reached` (k×P)."""
-    deviations = np.sqrt(np.diag(data.covariance))
-    for name, value, noise, values in zip(data.sensors, data.values, deviations, reached, strict=True):
-        low, high = float(values.min()), float(values.max())
+def refuse_unreachable(data: Data, problem: Problem, solved: Snapshots) -> None:
+    """Raise a `RequestError` for a value far from all that its sensor has at training parameters."""
+    noises = np.sqrt(np.diag(data.covariance))
+    for output, value, noise in zip(outputs_of(problem, data.sensors), data.values, noises, strict=True):
+        reached = output.values(solved.mu, solved.u, solved.lam)
+        low, high = reached.min(), reached.max()
         # The box may reach a little farther than the training parameters do.
         slack = 0.1 * (high - low) + 5.0 * noise
         if not low - slack <= value <= high + slack:
-            found = f"'{name}' is {value:.4g}, and the parameter box gives {low:.4g} to {high:.4g}"
+            found = f"'{output.name}' is {value:.4g}, and the parameter box gives {low:.4g} to {high:.4g}"
             raise RequestError(f"{found}; is the unit right?")

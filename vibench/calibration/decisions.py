@@ -41,9 +41,8 @@ import scipy.sparse as sp
 from cachetools import LRUCache
 
 from vibench.arrays import Array, SparseMatrix, is_sound
-from vibench.calibration.data import Data, outputs_of
+from vibench.calibration.data import Data, Sensors, outputs_of
 from vibench.errors import NumericalError, RequestError, UnsupportedError
-from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.dual_sets import DualSet
 from vibench.interfaces.formulations import FormulationAnswer
 from vibench.interfaces.parameters import ParameterBox, outside
@@ -88,27 +87,6 @@ class Prediction(NamedTuple):
 
 
 Predict = Callable[[Array], Prediction]
-
-
-class Sensors:
-    """Linear outputs of high-fidelity solutions, by their names; a `RequestError` if there is no such output.
-
-    Solutions are as accurate as bounds allow for: their natural residuals are at most `accuracy`.
-    """
-
-    # A hundredth of what is verified elsewhere, and a hundred times what is usual: bounds grow by twice its root.
-    accuracy = 1e-12
-
-    def __init__(self, problem: Problem, names: tuple[str, ...]) -> None:
-        self.outputs, self._solver = outputs_of(problem, names), HighFidelitySolver(problem)
-
-    def __call__(self, mu: Array) -> Array:
-        """The outputs (k,) at mu (d,); a `NumericalError` if the solution is less accurate."""
-        found = self._solver.solve(mu)
-        if not found.residuals.worst <= self.accuracy:
-            left = f"{found.residuals.worst:.1e} at mu = {mu.tolist()}, above {self.accuracy:.0e}"
-            raise NumericalError(f"the high-fidelity solution has the natural residual {left}")
-        return np.array([one.values(mu[None], found.u[:, None], found.lam[:, None])[0] for one in self.outputs])
 
 
 def refuse_bounded(K: DualSet) -> None:

@@ -42,7 +42,7 @@ def calibrate(
     Error bounds take the decisions of a Metropolis chain where they suffice. Elsewhere the high-fidelity model is
     asked. Ctrl-C keeps its answers, and the same command continues with them.
     """
-    from vibench.calibration.data import outputs_of, read_data, refuse_unreachable, share
+    from vibench.calibration.data import read_data, refuse_unreachable, share
     from vibench.calibration.decisions import Decisions, quickest_sensors, refuse_bounded
     from vibench.calibration.metropolis import Metropolis, arviz
     from vibench.execution.recorded_cell import cell_model, recorded_cell
@@ -64,9 +64,7 @@ def calibrate(
     with new_console().status(f"model: {chosen}"):
         model, training = timed(lambda: cell_model(chosen) if recorded is None else recorded.model)
     with placed(str(data)):
-        solved = model.offline.snapshots
-        sensors = outputs_of(target, measured.sensors)
-        refuse_unreachable(measured, [one.values(solved.mu, solved.u, solved.lam) for one in sensors])
+        refuse_unreachable(measured, target, model.offline.snapshots)
         # Compiling is part of the training.
         (predict, by), compiling = timed(lambda: quickest_sensors(model, measured.sensors))
     decisions = Decisions(target, measured, [predict], share(audit), seed)
@@ -93,15 +91,11 @@ def _trained_cell(problem: str, option: list[str] | None) -> Cell:
 def _write_synthetic(problem: Problem, mu: str, noise: float, file: Path, seed: int) -> None:
     """Write data of all linear outputs at a parameter, unless the file has the same ones."""
     from vibench.calibration.data import as_toml, synthetic
-    from vibench.calibration.decisions import Sensors
     from vibench.files import write_atomically, writing
     from vibench.offline.models import parameter_in
 
     at = parameter_in(problem.parameters, components("--synthetic", mu))
-    sensors = Sensors(problem, names := tuple(output.name for output in problem.outputs if output.linear))
-    if not names:
-        raise RequestError("the problem has no linear outputs, which sensors have to be")
-    text = as_toml(synthetic(names, sensors(at), noise, seed), sensors.outputs)
+    text = as_toml(synthetic(problem, at, noise, seed), problem)
     if file.exists() and file.read_text(encoding="utf-8") != text:
         raise RequestError(f"'{file}' exists with other data; leave out --synthetic, or choose another name")
     with writing(file):

@@ -30,10 +30,10 @@ def write_pack(
     training = training_parameters(problem)
     listed = np.vstack([training, validation_parameters(problem, validation, seed)])
     with _new_folder(folder) as part:
-        lines = ["format = 1", f"name = {_toml_text(name)}", f"source = {_toml_text(source)}", ""]
+        lines = ["format = 1", f"name = {toml_text(name)}", f"source = {toml_text(source)}", ""]
         box = problem.parameters
         _save(part / "parameters.npz", {"training": training, "validation": listed[len(training) :]})
-        names, units = (", ".join(map(_toml_text, texts)) for texts in (box.names, box.units))
+        names, units = (", ".join(map(toml_text, texts)) for texts in (box.names, box.units))
         lines += ["[parameters]", f"names = [{names}]", f"units = [{units}]"]
         lines += [f"lower = {box.lower.tolist()}", f"upper = {box.upper.tolist()}"]
         lines += [f'{role} = "parameters.npz:{role}"' for role in ("training", "validation")] + [""]
@@ -88,7 +88,7 @@ def _operator_table(problem: Problem, listed: Array, part: Path) -> list[str]:
             if name not in problem.affine and (k == 0 or name not in problem.constant):
                 arrays[name][str(k)] = getattr(vi, name)
     entrywise = sorted((problem.entrywise | set(problem.affine)) - problem.constant)
-    lines = ["[operators]", f"entrywise = [{', '.join(map(_toml_text, entrywise))}]"]
+    lines = ["[operators]", f"entrywise = [{', '.join(map(toml_text, entrywise))}]"]
     for name in MEMBERS:
         if name in problem.affine:
             # Its terms, and its coefficients at the listed parameters: functions have no place in a pack.
@@ -123,7 +123,7 @@ def _output_tables(problem: Problem, part: Path) -> list[str]:
     lines: list[str] = []
     arrays: dict[str, Array] = {}
     for k, output in enumerate(output for output in problem.outputs if output.linear):
-        lines += ["[[outputs]]", f"name = {_toml_text(output.name)}", f"unit = {_toml_text(output.unit)}"]
+        lines += ["[[outputs]]", f"name = {toml_text(output.name)}", f"unit = {toml_text(output.unit)}"]
         for key, values in (("u", output.u), ("lam", output.lam)):
             if values is not None:
                 arrays[f"{key}{k}"] = values
@@ -149,6 +149,6 @@ def _save(file: Path, arrays: Mapping[str, Any]) -> None:
     np.savez_compressed(file, allow_pickle=False, **parts)
 
 
-def _toml_text(value: str) -> str:
+def toml_text(value: str) -> str:
     """A text as a TOML string, which is one of JSON but for the character DEL."""
     return json.dumps(value).replace("\x7f", "\\u007f")

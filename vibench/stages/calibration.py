@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibench.calibration.data import Prior, synthetic
-from vibench.calibration.decisions import Decisions, Predict, Prediction, Sensors, quickest_sensors
+from vibench.calibration.data import Prior, outputs_of, synthetic
+from vibench.calibration.decisions import Decisions, Predict, Prediction, quickest_sensors
 from vibench.calibration.metropolis import Metropolis
-from vibench.errors import NumericalError
 from vibench.offline.models import Model
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Result, Row, Stage
@@ -41,15 +40,13 @@ class CalibrationStage(Stage):
     def run(self, store: Store) -> Result:
         model, seed = self.queries.bounded_model(store), self.queries.validation_set.seed
         problem, box = model.problem, model.parameters
-        sensors = tuple(output.name for output in problem.outputs if output.linear)
-        if not sensors:
-            raise NumericalError("the problem has no linear outputs, which sensors have to be")
+        sensors = tuple(output.name for output in outputs_of(problem))
         unbounded = model.certificate is None
         predict, by = (_unbounded(model, sensors), "model") if unbounded else quickest_sensors(model, sensors)
-        exact = Sensors(problem, sensors)(box.sample(1, seed)[0])
         rows: list[Row] = []
         for noise in (0.03, 0.01, 0.003):
-            decisions = Decisions(problem, synthetic(sensors, exact, noise, seed), (predict,), 0.01, seed)
+            data = synthetic(problem, box.sample(1, seed)[0], noise, seed)
+            decisions = Decisions(problem, data, (predict,), 0.01, seed)
             # As many steps as show a decision in a hundred.
             chain = Metropolis(decisions, Prior.of(box), 100, seed)
             while chain.steps < 400:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import vibench
-from vibench.calibration.decisions import BoundedSensors, Sensors
+from vibench.calibration.data import Sensors
+from vibench.calibration.decisions import BoundedSensors
 from vibench.errors import NumericalError
 from vibench.qp.exact import exact_solution
 from vibench.qp.verification import kkt_residuals

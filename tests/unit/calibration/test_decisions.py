@@ -14,14 +14,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import vibench
-from vibench.calibration.data import Data, Prior
+from vibench.calibration.data import Data, Prior, Sensors
 from vibench.calibration.decisions import (
     BoundedSensors,
     CompiledSensors,
     Decisions,
     Prediction,
     RefutedError,
-    Sensors,
     quickest_sensors,
 )
 from vibench.calibration.metropolis import Metropolis, summary
@@ -273,12 +272,12 @@ def test_without_a_compiler_python_answers_and_says_why(monkeypatch: pytest.Monk
     predict, by = quickest_sensors(radial(), NAMES)
     assert isinstance(predict, BoundedSensors)
     assert by == "Python: the environment variable CC names the C compiler 'no-such-compiler', which is not found"
-    with pytest.raises(RequestError, match="no output of the problem is called 'deflection'"):
+    with pytest.raises(RequestError, match="no linear output of the problem is called 'deflection'"):
         quickest_sensors(radial(), ("deflection",))
 
 
 def test_what_has_no_bound_is_refused() -> None:
-    with pytest.raises(RequestError, match="no output of the problem is called 'deflection'"):
+    with pytest.raises(RequestError, match="no linear output of the problem is called 'deflection'"):
         BoundedSensors(radial(), ("deflection",))
     with pytest.raises(RequestError, match="the model has no error bounds"):
         BoundedSensors(replace(radial(), certificate=None), NAMES)

@@ -97,7 +97,7 @@ RIGHT: dict[str, Any] = {"value": -0.07, "noise": 0.001}
 @pytest.mark.parametrize(
     ("sensors", "rest", "said"),
     [
-        ({"outer": RIGHT}, "", "no output of the problem is called 'outer' (known: inner deflection"),
+        ({"outer": RIGHT}, "", "no linear output of the problem is called 'outer' (known: inner deflection"),
         ({OUTER: {**RIGHT, "unit": "mm"}}, "", f"sensors.{OUTER}.unit is 'mm', the output has 'm'"),
         ({OUTER: {"value": 1.0}}, "", f"sensors.{OUTER}.noise: expected a standard deviation"),
         ({OUTER: {"value": 0.0, "noise": "1%"}}, "", "a share of a value that is not 0"),
@@ -132,7 +132,11 @@ def test_faults_of_a_data_file_are_named(sensors: dict[str, Any], rest: str, sai
 @pytest.mark.parametrize(
     ("problem", "sensor", "said"),
     [
-        ("hertz", "contact half-width", "is no linear output, and has no bound; linear: contact force, indentation"),
+        (
+            "hertz",
+            "contact half-width",
+            "no linear output of the problem is called 'contact half-width' (known: contact force, ",
+        ),
         ("tresca", "tangential force", "data.toml: λ has no bound, which the accuracy of solutions needs: no beta_A"),
     ],
 )
