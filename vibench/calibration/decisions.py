@@ -4,29 +4,9 @@ Bounds of outputs give an interval of the misfit. Whether one parameter fits bet
 intervals are apart; otherwise the high-fidelity model is asked. A method that consists of such decisions takes the path
 of the high-fidelity model, step by step.
 
-**The accuracy of the high-fidelity solution.** Bounds are distances from the exact solution (u, λ), decisions those of
-the computed one (û, λ̂). Let r = f − Aû − Bᵀλ̂, s = Bû − g, d = û − u, and let U be the unit of its natural residuals,
-which are at most ε (`Sensors.accuracy`). In the norms of A and A⁻¹ (`vibench.qp.verification`)
-
-    ‖r‖ ≤ εU,    (s_i)₊ ≤ εU ‖B_i‖,    |λ̂ᵀs| ≤ εU²,    U ≤ max(‖Bᵀλ‖, √(‖û‖² + ‖Bᵀλ̂‖²)).
-
-Let d_i ≥ ‖B_i‖, P ≥ ‖u‖ and P ≥ Σ λ_i d_i ≥ ‖Bᵀλ‖. The difference solves A d + Bᵀ(λ̂ − λ) = −r; its product with d,
-λ̂ᵀ(Bu − g) ≤ 0 and λᵀ(Bu − g) = 0 give
-
-    ‖d‖² ≤ ‖d‖ ‖r‖ + |λ̂ᵀs| + λᵀ(s)₊ ≤ ε (U ‖d‖ + U² + UP),    ‖Bᵀ(λ̂ − λ)‖ ≤ D := ‖d‖ + εU.
-
-Since U ≤ √2 (P + D), the first line is at most (2 + √2) ε (P + D)². Hence D ≤ 1.85 √ε (P + D), and D ≤ 1.86 √ε P.
-Both errors are thus at most δ = 2 √ε P, and round-off is small beside the rest of the factor 2:
-- Verification passes a violation below the round-off of its row, which has b entries. It is at most 3 (b + 2) 2⁻⁵² d_i
-  times ‖û‖ where d_i bounds Σ_j |B_ij| ‖e_j‖, as below: ε is at least 3 (b + 2) 2⁻⁵² here.
-- It may judge λ̂ with A⁻¹(f − Bᵀλ̂) in place of û. These differ by at most 64 · 2⁻⁵² √(|û|ᵀ|A||û|), or 1e-14 √(k/σ) ‖û‖
-  for k entries in a row of X ≽ σ diag(X) at γ = α: less than √ε/10 ‖û‖ down to σ = 1e-12.
-- Outputs and misfits are sums of at most n products.
-Opposite rows, whose gaps verification leaves out, have β = 0, and no bounds here.
-
-P follows from the reduced solution: ‖u‖ ≤ ‖u_N‖ + Δ_u, and with W ≽ σ diag(W)
-
-    Σ λ_i d_i ≤ Σ λ_N,i d_i + √(Σ d_i²/(σ W_ii)) ‖λ − λ_N‖_W.
+Bounds are distances from the exact solution, decisions those of the computed one, whose natural residuals are at most ε
+(`Sensors.accuracy`). Bounds grow by the distance of these two, δ = 2 √ε P, where P is at least ‖u‖ and Σ λ_i ‖B_i‖: see
+docs/mathematics.md, "Decisions".
 """
 
 from __future__ import annotations
@@ -50,7 +30,7 @@ from vibench.interfaces.problem import Problem
 from vibench.linalg import EPS
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.bound_terms import CorrectionMode
-from vibench.model.certificates.base import Guarantee, output_coefficients, output_weights
+from vibench.model.certificates.base import Guarantee, output_coefficients
 from vibench.model.certificates.bounds import OnlineBound, output_error_bound
 from vibench.model.galerkin import Evaluated, contact_at
 from vibench.model.hyperreduced import HyperReducedModel
@@ -115,7 +95,7 @@ class BoundedSensors:
         self._root = np.sqrt((1.0 + self.base.compliance_error) * np.diag(self.base.compliance))
         # Where B(µ) is θ(µ) B₀ it need not be assembled.
         self._is_scaled, self._reach = self.base.bound_terms is not None, self._lengths(self.base.constraint)
-        self._weights = [output_weights(problem, self.base, output) for output in outputs]
+        self._weights = [model.output_weights[name] or (inf, inf) for name in names]
         of_u, of_lam = map(np.array, zip(*(output_coefficients(problem, output) for output in outputs), strict=True))
         self.correlation = None if of_lam.any() else _correlation(self.base.X, of_u, np.array(self._weights)[:, 0])
         reduced, self._of_alpha = model.reduced, of_lam @ model.reduced.generators

@@ -40,11 +40,10 @@ def fmu(source: str, arrays: Mapping[str, Array], about: Mapping[str, Any], stem
         raise RequestError(f"two variables of the FMU would have the name '{twice}'; rename a parameter or an output")
     # The same model has the same identifier, and is the same file.
     guid = hashlib.sha256(f"{source}{variables}{corrected}".encode()).hexdigest()[:32]
-    rows, loads = (
-        (len(arrays["certificate_generators"]), arrays["certificate_outputs_shift"].shape[1]) if certified else (1, 1)
-    )
     source += c_source.filled("fmu.c", {
-        "name": name, "guid": guid, "start": ", ".join(map(repr, start.tolist())), "rows": rows, "loads": loads,
+        "name": name, "guid": guid, "start": ", ".join(map(repr, start.tolist())),
+        "rows": len(arrays["certificate_generators"]) if certified else 1,
+        "loads": arrays["certificate_outputs_shift"].shape[1] if certified else 1,
         "certified": int(certified), "corrected": corrected, "output_count": len(outputs), "values": len(variables),
     })  # fmt: skip
     # The program may run on another processor than this one.
