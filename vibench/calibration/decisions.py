@@ -235,12 +235,12 @@ class Interval:
 class Counts:
     """Decisions, those that bounds left open, audits, decisions that the reduced model takes wrongly without bounds."""
 
-    decisions: int = 0
-    undecided: int = 0
-    audits: int = 0
-    wrong: int = 0
+    decisions: int
+    undecided: int
+    audits: int
+    wrong: int
     # CPU seconds of the reduced model.
-    model_seconds: float = 0.0
+    model_seconds: float
 
 
 @bordered
@@ -266,7 +266,7 @@ class Decisions:
         self, problem: Problem, data: Data, models: Sequence[Predict],
         audit: Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)], seed: Seed,
     ) -> None:  # fmt: skip
-        self.data, self.counts, self.guarantee = data, Counts(), Guarantee.CERTIFIED
+        self.data, self.counts, self.guarantee = data, Counts(0, 0, 0, 0, 0.0), Guarantee.CERTIFIED
         self._box, self._models, self._audit = problem.parameters, tuple(models), audit
         self._solve, self._random = Sensors(problem, data.sensors), np.random.default_rng(seed)
         # Misfit and CPU seconds of the high-fidelity model by the bytes of the parameter: all that were asked, and

@@ -71,8 +71,11 @@ class _Request(BaseHTTPRequestHandler):
     """A request in a thread, which is answered by what it asks for or by an error of the protocol."""
 
     server: ModelServer
-    # A client that says nothing for a minute has no thread any longer.
-    timeout = 60.0
+
+    def setup(self) -> None:
+        # A client that says nothing for a minute has no thread any longer.
+        self.request.settimeout(60.0)
+        super().setup()
 
     def do_GET(self) -> None:
         server, call = self.server, f"{self.command} {self.path}"
