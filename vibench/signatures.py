@@ -69,6 +69,7 @@ def bordered(called: F, owner: type | None = None, declared: Callable[..., Any] 
         signature().check(given, named)
         return called(*given, **named)
 
+    call.unchecked = called  # type: ignore[attr-defined]
     return cast(F, call)
 
 
@@ -83,8 +84,9 @@ def overridden(kind: type, module: str, *unchecked: str) -> None:
 
 
 def inside(method: F) -> F:
-    """A method of an object without the checks of `overridden`, for calls by vibench, which are timed."""
-    return cast(F, types.MethodType(inspect.unwrap(method.__func__), method.__self__))  # type: ignore[attr-defined]
+    """A method of an object without the checks of `overridden`, for calls by vibench; decorators of others stay."""
+    is_checked = isinstance(method, types.MethodType) and hasattr(method, "unchecked")
+    return cast(F, types.MethodType(method.unchecked, method.__self__)) if is_checked else method  # type: ignore[attr-defined]
 
 
 def constructed(kind: type[T]) -> type[T]:

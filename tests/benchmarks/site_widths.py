@@ -12,7 +12,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from helpers.browsing import chromium, look
+from helpers.browsing import chromium, look, resize
 
 WIDTHS = 1280, 390
 
@@ -20,7 +20,7 @@ BEYOND = """
 const width = document.documentElement.clientWidth;
 const scrolls = element => ["auto", "scroll", "hidden"].includes(getComputedStyle(element).overflowX);
 const inside = element => {
-    for (let up = element.parentElement; up; up = up.parentElement)
+    for (let up = element.parentElement; up !== document.body; up = up.parentElement)
         if (scrolls(up) && up.getBoundingClientRect().right <= width + 1) return true;
     return false;
 };
@@ -28,7 +28,7 @@ const beyond = [...document.querySelectorAll(".md-content *")].filter(element =>
     const box = element.getBoundingClientRect();
     return box.width && box.right > width + 1 && !inside(element);
 });
-const wide = document.documentElement.scrollWidth > window.innerWidth;
+const wide = document.documentElement.scrollWidth > width;
 const named = beyond.slice(0, 3).map(one => `${one.tagName} ${one.textContent.slice(0, 40)}`);
 return [...(wide ? ["the page"] : []), ...named];
 """
@@ -47,8 +47,9 @@ def faults(site: Path) -> Iterator[str]:
         sys.exit(f"{site}: no pages")
     with tempfile.TemporaryDirectory() as downloads, chromium(Path(downloads)) as browser:
         for page in pages:
+            look(browser, page)
             for width in WIDTHS:
-                look(browser, page, width=width)
+                resize(browser, width)
                 if found := browser.execute_script(BEYOND):
                     yield f"{page.relative_to(site)} at {width}: {'; '.join(found)}"
 

@@ -66,11 +66,15 @@ def chromium(downloads: Path) -> Iterator[webdriver.Chrome]:
 
 
 def look(browser: webdriver.Chrome, page: Path, *, width: int = 1280, theme: str = "light", fragment: str = "") -> None:
-    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    resize(browser, width)
     prefer(browser, theme)
     browser.get("about:blank")  # a change of the fragment alone would not load the page again
     load(browser, page.as_uri() + fragment)
+
+
+def resize(browser: webdriver.Chrome, width: int) -> None:
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
 
 
 def prefer(browser: webdriver.Chrome, theme: str) -> None:

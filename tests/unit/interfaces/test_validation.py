@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import wraps
 from typing import Any
 from unittest.mock import Mock
 
@@ -247,6 +248,16 @@ def test_methods_of_a_plugin_refuse_wrong_arguments(given: Any) -> None:
     for call in (WIRE.assemble, WIRE.constraint, lambda mu: Declared().picture(mu, np.ones(12), np.ones(12))):
         with pytest.raises(RequestError, match="mu of "):
             call(given)
+
+
+def test_decorators_that_an_author_puts_on_a_method_are_kept() -> None:
+    calls = list[Array]()
+
+    def counted(method: Callable[[Chain, Array], VariationalInequality]) -> Callable[..., VariationalInequality]:
+        return wraps(method)(lambda self, mu: calls.append(mu) or method(self, mu))
+
+    checked_assembly(type("Counted", (Chain,), {"assemble": counted(Chain.assemble)})(), MU)
+    assert calls == [MU]
 
 
 def test_what_is_true_is_confirmed_whatever_the_units_and_absent_rows() -> None:
