@@ -145,6 +145,22 @@ def test_what_knows_contact_alone_says_so(coarse: Tresca, snapshots: Snapshots) 
         coarse.constant = declared  # type: ignore[misc]
 
 
+@pytest.mark.parametrize("dual", [HullGreedy(), PODDual()])
+def test_supremizers_leave_no_residual_and_corrections_give_the_solution(
+    coarse: Tresca, snapshots: Snapshots, dual: DualStrategy
+) -> None:
+    # In the energy norm u = -A⁻¹ Bᵀ λ is in V_N for all λ of the reduced set.
+    phase = Reduction(coarse, dual, OnlineSupremizers(), Stop(size=5), Stop(size=5), formulation=DualProgram())
+    model, mu = phase.given(snapshots=snapshots).model, np.array([0.8, 0.55])
+    answer, exact, kept = model.solve(mu), HighFidelitySolver(coarse).solve(mu), assemblies(coarse)
+    vi, energy = kept.at(mu), kept.energy_at(mu)
+    assert energy.dual_norm(vi.A @ answer.u + vi.B.T @ answer.lam) < 1e-9 * energy.norm(exact.u)
+    assert coarse.W.norm(answer.lam - exact.lam) > 0.01 * coarse.W.norm(exact.lam)
+    pair = corrected_pair(vi, energy, answer.u, answer.lam)
+    assert pair is not None
+    assert coarse.W.norm(pair.lam - exact.lam) < 1e-9 * coarse.W.norm(exact.lam)
+
+
 @pytest.mark.parametrize("dual", [HullGreedy(), pytest.param(PODDual(), marks=pytest.mark.long)])
 def test_bounds_at_online_cost_hold_and_are_sharp(dual: DualStrategy, coarse: Tresca, snapshots: Snapshots) -> None:
     phase = Reduction(coarse, dual, OnlineSupremizers(), Stop(size=5), Stop(size=6), assembly="reduced", bounds=True)
