@@ -43,7 +43,7 @@ class LazyMaximum:
 
     def next(self, evaluate: Callable[[int], float]) -> tuple[int, float]:
         """Index of the largest indicator, the smallest one within `TIE`, and the value; `evaluate(p)` is that of p."""
-        fresh = np.zeros(len(self._bounds), dtype=bool)
+        fresh = np.isneginf(self._bounds)  # excluded
         while True:
             largest = float(self._bounds.max())
             candidates = np.flatnonzero(self._bounds >= largest - self._tie)
@@ -171,23 +171,22 @@ class GrowingCone:
         return stop.reached(self.generators.shape[1], self.error) or self.error <= REPRODUCED
 
     def add(self, direction: Annotated[Array, "m"], note: str = "") -> bool:
-        """Add the generator of a direction (m,), part of `farthest`, with a `note` on any deviation from the algorithm.
+        """Add the generator of a direction (m,), such as `farthest`, with a `note` on a deviation from the algorithm.
 
-        `False` where the direction is nothing but round-off, as it is if all snapshots are reproduced.
+        `False` where the direction is nothing but round-off, as it is if all snapshots are reproduced, and where there
+        are as many generators as snapshots, which would themselves be enough.
         """
         if note:
             self._fallbacks.append(f"generator {self.generators.shape[1] + 1}: {note}")
         length = float(self._W.norm(direction))
-        if not self.error or length <= REPRODUCED * self._norms[self.farthest]:
+        complete = not self.error or self.generators.shape[1] == len(self._norms)
+        if complete or length <= REPRODUCED * self._norms[self.farthest]:
             # Normalised, round-off would be an arbitrary generator.
             return False
         self.generators = np.column_stack([self.generators, direction / length])
-        # The snapshot is in the cone now (Remark 4.1).
         self._distances.widen(self._W.whiten(self.generators), self.farthest)
-        if self.generators.shape[1] == len(self._norms):  # every snapshot has been taken
-            self.error = 0.0
-        else:
-            self.farthest, self.error = self._distances.next()
+        self.farthest, largest = self._distances.next()
+        self.error = max(largest, 0.0)  # of no snapshot if all are excluded
         self._errors.append(self.error)
         return True
 
@@ -235,10 +234,14 @@ class LazyDistances:
         self._largest = float(norms.max())
         self._generators = np.zeros((whitened.shape[0], 0))
         self._coefficients = np.zeros((0, whitened.shape[1]))  # one point of the cone for every snapshot
+        self._taken = np.zeros(whitened.shape[1], bool)
         self.maximum = LazyMaximum(norms / self._largest)
 
     def widen(self, generators: Annotated[Array, "m", "r"], taken: Count | None = None) -> None:
-        """Add the last of the generators (m×r, unit norm, whitened); the snapshot `taken` is never chosen again."""
+        """Add the last of the generators (m×r, unit norm, whitened), which is of the snapshot `taken`.
+
+        That one is not chosen again if it is in the cone to round-off (paper, Remark 4.1).
+        """
         if generators.shape[1] != (count := len(self._coefficients) + 1):
             raise RequestError(
                 f"widen is given {generators.shape[1]} generators, expected {count}, the last of them new"
@@ -252,9 +255,13 @@ class LazyDistances:
             step = np.maximum(slope[i], -self._coefficients[i])
             self._coefficients[i] += step
             slope -= row[:, None] * step
-        self.maximum.bound(np.linalg.norm(self._snapshots - generators @ self._coefficients, axis=0) / self._largest)
+        bounds = np.linalg.norm(self._snapshots - generators @ self._coefficients, axis=0) / self._largest
+        self.maximum.bound(bounds)
         if taken is not None:
-            self.maximum.exclude(taken)
+            _refuse_beyond(taken, len(bounds))
+            self._taken[taken] = True
+            if bounds[taken] <= TIE:
+                self.maximum.exclude(taken)
 
     def next(self) -> tuple[int, float]:
         """Index of the snapshot farthest from the cone, and its distance, those taken excluded."""
@@ -268,7 +275,8 @@ class LazyDistances:
     def _distance(self, q: int) -> float:
         projection = _project_whitened(self._generators, self._snapshots[:, q])
         self._coefficients[:, q] = projection.coefficients
-        return projection.distance / self._largest
+        distance = projection.distance / self._largest
+        return -np.inf if self._taken[q] and distance <= TIE else distance
 
 
 def _best_combination(points: Array, nu: Array, targets: Array) -> tuple[Array, Array]:
