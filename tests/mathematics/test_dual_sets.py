@@ -76,8 +76,8 @@ def test_values_by_hand() -> None:
         [0.0, 1.2, 1.6, 1.0, 1.0, 0.5]
     )
     assert K.free(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.5])).tolist() == [True, False, False, False, False, False]
-    assert K.of(np.array([0, 3, 4, 5]), 6).names() == "cones and intervals"
-    assert K.of(np.array([3, 4]), 6) == DualSet((Blocks(BlockKind.CONE, np.array([[0, 1]])),)) != K
+    assert K.of(np.array([0, 3, 4, 5])).names() == "cones and intervals"
+    assert K.of(np.array([3, 4])) == DualSet((Blocks(BlockKind.CONE, np.array([[0, 1]])),)) != K
 
 
 @pytest.mark.parametrize(
@@ -261,7 +261,7 @@ def test_another_set_is_a_class_of_its_own() -> None:
     for name in ("support", "gauge", "project", "contains"):
         assert np.array_equal(getattr(K, name)(y), getattr(intervals, name)(y))
     assert K.gap(K.project(y), -y) == intervals.gap(K.project(y), -y) == 0.0
-    assert isinstance(K.of(np.array([1, 2, 3]), 4).blocks[0], Box)
+    assert isinstance(K.of(np.array([1, 2, 3])).blocks[0], Box)
     assert DualSet((Blocks(BlockKind.DISC, *given[1:]),)) != K
     with pytest.raises(RequestError, match="another set is a class of its own"):
         Blocks(*given)

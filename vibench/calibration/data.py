@@ -22,7 +22,7 @@ from vibench.interfaces.parameters import ParameterBox, outside
 from vibench.interfaces.problem import Problem
 from vibench.offline.exported import linear_outputs
 from vibench.packs.writer import toml_text
-from vibench.signatures import Rule, bordered, inside, is_plain
+from vibench.signatures import Rule, bordered, is_plain
 from vibench.study.matrix import read_toml
 
 # Infinite where nothing is known.
@@ -89,7 +89,7 @@ class Data:
 
     def misfit(self, outputs: Annotated[Array, "k"]) -> float:
         """½ (s − d)ᵀ C⁻¹ (s − d) of outputs s (k,): the negative logarithm of the likelihood, up to a constant."""
-        return inside(self.interval)(outputs, np.zeros(len(outputs)))[0]
+        return self.interval(outputs, np.zeros(len(outputs)))[0]
 
     def interval(
         self, outputs: Annotated[Array, "k"], bounds: Annotated[Sizes, "k"],

@@ -40,7 +40,7 @@ from vibench.offline.compiled import loaded
 from vibench.offline.exported import exported
 from vibench.offline.models import Model
 from vibench.qp.verification import QPSolution, extended
-from vibench.signatures import Rule, Seed, bordered, constructed, inside
+from vibench.signatures import Rule, Seed, bordered, constructed
 from vibench.stability.coercivity import share_of_diagonal
 from vibench.timing import timed
 
@@ -286,7 +286,7 @@ class Decisions:
             elif self._models:
                 self._narrow(mu, known)
             if key in self.answers:
-                inside(self.ask)(mu)
+                self.ask(mu)
         return self._recent[key]
 
     def _narrow(self, mu: Array, known: Interval) -> None:
@@ -296,8 +296,8 @@ class Decisions:
             self.counts.model_seconds += spent.cpu
             if guarantee is not Guarantee.CERTIFIED:
                 self.guarantee = Guarantee.VERIFIED
-            lower, upper = inside(self.data.interval)(outputs, bounds, correlation)
-            known.middle, by = inside(self.data.misfit)(outputs), "another model"
+            lower, upper = self.data.interval(outputs, bounds, correlation)
+            known.middle, by = self.data.misfit(outputs), "another model"
         else:
             if (key := mu.tobytes()) not in self.answers:
                 self.answers[key] = self.earlier.get(key) or self._solved(mu)
@@ -314,7 +314,7 @@ class Decisions:
 
     def ask(self, mu: Annotated[Array, "d"]) -> float:
         """The misfit of the high-fidelity model at mu (d,), which is kept; a `RefutedError` if bounds exclude it."""
-        known = inside(self.interval)(mu)
+        known = self.interval(mu)
         if known.level <= len(self._models):
             known.level = len(self._models)
             self._narrow(mu, known)
@@ -325,7 +325,7 @@ class Decisions:
 
         Raises a `RefutedError` if an answer of the high-fidelity model contradicts the bounds.
         """
-        one, other = map(inside(self.interval), (a, b))
+        one, other = map(self.interval, (a, b))
         is_open = False
         while (verdict := one.below(other, shift)) is None:
             # Later decisions compare with b again, the present state of a chain: it is queried and asked first.
@@ -335,7 +335,7 @@ class Decisions:
         if not is_open and self._models and self._random.random() < self._audit:
             self.counts.audits += 1
             for mu in (a, b):
-                inside(self.ask)(mu)
+                self.ask(mu)
         self.counts.decisions += 1
         self.counts.undecided += is_open
         self.counts.wrong += bool(self._models and (one.middle < other.middle + shift) != verdict)

@@ -12,7 +12,7 @@ from vibench.arrays import Array, Mask
 from vibench.calibration.data import Prior
 from vibench.calibration.decisions import Decisions
 from vibench.errors import foreign
-from vibench.signatures import Count, Seed, constructed, inside
+from vibench.signatures import Count, Seed, constructed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,7 +57,7 @@ class Metropolis:
         root = np.linalg.cholesky(self._scatter + 1e-12 * np.eye(box.dim))
         proposal = present + np.exp(self._log_scale) * (root @ normal) * box.widths
         # The logarithm of a uniform number in (0, 1].
-        density, less = inside(self.prior.log_density), inside(self.decisions.less)
+        density, less = self.prior.log_density, self.decisions.less
         gain = density(proposal) - density(present) - np.log1p(-uniform)
         moves = bool(gain > -np.inf) and less(proposal, present, float(gain))
         self._visited.append(proposal if moves else present)

@@ -10,7 +10,7 @@ from vibench.arrays import Array
 from vibench.calibration.decisions import Decisions
 from vibench.errors import foreign
 from vibench.interfaces.parameters import ParameterBox
-from vibench.signatures import AtLeastOne, Positive, Seed, bordered, inside
+from vibench.signatures import AtLeastOne, Positive, Seed, bordered
 
 
 @bordered
@@ -34,7 +34,7 @@ def minimise(
     limits = {"seed": seed % (2**32 - 1) + 1, "bounds": unit_cube, "tolx": tolx, "maxiter": iterations, "verbose": -9}
     strategy = cma.CMAEvolutionStrategy(np.full(box.dim, 0.5), 0.2, limits | ignored)
 
-    less = inside(decisions.less)
+    less = decisions.less
 
     def compare(one: tuple[int, Array], other: tuple[int, Array]) -> int:
         return -1 if less(one[1], other[1]) else 1

@@ -14,17 +14,17 @@ from vibench.arrays import Array, Indices, Mask, SparseMatrix, read_only
 from vibench.errors import NumericalError, at_parameter
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness, condensed_stiffness
 from vibench.interfaces.dual_sets import BlockKind, DualSet, refuse_blocks
-from vibench.interfaces.problem import NestedStart, Problem, VariationalInequality
+from vibench.interfaces.problem import NestedStart, OfBox, Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly, in_float64, settled
 from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.linalg.inner_product import check_positive_definite, check_symmetric
+from vibench.linalg.inner_product import InnerProduct, check_positive_definite, check_symmetric
 from vibench.linalg.schur_complement import FEW_PER_UNKNOWN, EliminationPattern
 from vibench.qp import verification
 from vibench.qp.exact import Directions, least_distance_solution, rows_that_matter
 from vibench.qp.scaling import peak, ratio, row_norms
 from vibench.qp.solve import solve_qp
-from vibench.signatures import bordered, constructed, rule_of
+from vibench.signatures import bordered, rule_of
 from vibench.text import one_line, shown
 
 Iterated = tuple[Array, Array, int]  # u (n,), λ (m,) and the number of linear systems
@@ -39,8 +39,8 @@ class ActiveSetSolution:
     `fallback` says what was used besides the active set method, "" if nothing; `iterations` counts its linear systems.
     """
 
-    u: Array
-    lam: Array
+    u: Annotated[Array, "n"]
+    lam: Annotated[Array, "m"]
     fallback: str
     iterations: int
 
@@ -52,7 +52,7 @@ class HighFidelitySolution(ActiveSetSolution):
     residuals: verification.Residuals
 
 
-@constructed
+@bordered
 class HighFidelitySolver:
     """Solves one problem at many parameters, each from the contact set of the nearest one solved, or its `start`.
 
@@ -65,8 +65,13 @@ class HighFidelitySolver:
     case: error bounds are of that size.
     """
 
+    # What arguments of methods fit.
+    _V: Annotated[InnerProduct, "n"]
+    _W: Annotated[InnerProduct, "m"]
+    _width: Annotated[Array, "d"]
+
     def __init__(self, problem: Problem, *, condensing: bool = False) -> None:
-        self._problem, self._condensing = problem, condensing
+        self._problem, self._condensing, self._V, self._W = problem, condensing, problem.V, problem.W
         self._constrained = problem.contact_dofs if problem.contact_dofs is not None else np.zeros(0, dtype=np.intp)
         self._pattern: EliminationPattern | None = None
         self._stiffness: CondensedStiffness | None = None
@@ -77,8 +82,7 @@ class HighFidelitySolver:
         self._solved: list[Array] = []
         self._active: list[Mask] = []
 
-    @bordered
-    def solve(self, mu: Annotated[Array, "d"]) -> HighFidelitySolution:
+    def solve(self, mu: OfBox) -> HighFidelitySolution:
         """Assemble and solve at mu (d,).
 
         Raises a `NumericalError` if the assembly is invalid, the solution does not reach `ACCURACY`, the problem
@@ -86,13 +90,13 @@ class HighFidelitySolver:
         """
         return self.solve_next(mu, checked_assembly(self._problem, mu))
 
-    def solve_next(self, mu: Array, vi: VariationalInequality) -> HighFidelitySolution:
+    def solve_next(self, mu: OfBox, vi: VariationalInequality) -> HighFidelitySolution:
         """As `solve`, of what vibench itself has assembled: checks would take a tenth of a solution that is timed."""
         solution = self.verify(mu, vi, self.solve_assembled(mu, vi))
         self.remember(mu, solution)
         return solution
 
-    def solve_assembled(self, mu: Array, vi: VariationalInequality) -> ActiveSetSolution:
+    def solve_assembled(self, mu: OfBox, vi: VariationalInequality) -> ActiveSetSolution:
         """Solve the variational inequality `vi` assembled at mu (d,); unless remembered, no other starts from it.
 
         Raises a `NumericalError` that names mu, and what A lacks if that is the cause.
@@ -101,7 +105,7 @@ class HighFidelitySolver:
         with at_parameter(mu), _explained(vi, f"A at mu = {mu.tolist()}"):
             return solve_unverified(vi, self.condensed(vi), self._start(mu))
 
-    def verify(self, mu: Array, vi: VariationalInequality, unverified: ActiveSetSolution) -> HighFidelitySolution:
+    def verify(self, mu: OfBox, vi: VariationalInequality, unverified: ActiveSetSolution) -> HighFidelitySolution:
         """The solution of `vi`, which has to be the variational inequality solved last, at mu (d,), verified.
 
         Raises a `NumericalError` that names mu if A is not symmetric positive definite, which a constant one is asked
@@ -119,7 +123,7 @@ class HighFidelitySolver:
                 raise NumericalError(one_line(str(reason)))
             return solution
 
-    def remember(self, mu: Array, solution: ActiveSetSolution) -> None:
+    def remember(self, mu: OfBox, solution: ActiveSetSolution) -> None:
         """Let later solutions start from the contact set of this one, at mu (d,)."""
         self._solved.append(mu)
         self._active.append(read_only(self._problem.K.free(solution.lam)))
@@ -135,7 +139,7 @@ class HighFidelitySolver:
         if self._active:
             distances = np.linalg.norm((np.array(self._solved) - mu) / self._width, axis=1)
             nearest = self._active[int(np.argmin(distances))]
-        start, m = self._problem.start(mu.copy(), nearest), self._problem.W.dim
+        start, m = self._problem.start(mu.copy(), nearest), self._W.dim
         if isinstance(start, NestedStart):
             if self._coarse is None or self._coarse._problem is not start.coarse:
                 self._coarse = HighFidelitySolver(start.coarse)

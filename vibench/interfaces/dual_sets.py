@@ -18,14 +18,17 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
 from vibench.arrays import Array, Indices, Mask, read_only
 from vibench.errors import RequestError, UnsupportedError
 from vibench.linalg import EPS
-from vibench.signatures import bordered, constructed
+from vibench.signatures import Count, NotNegative, Rule, bordered
+
+OfRows: TypeAlias = Annotated[Array, "m"]
+Rising: TypeAlias = Annotated[Indices, Rule("rising indices", lambda rows: bool((np.diff(rows) > 0).all())), "k"]
 
 
 class BlockKind(StrEnum):
@@ -48,7 +51,7 @@ class Blocks:
     """
 
     kind: BlockKind
-    rows: Annotated[Indices, "b", "k"]
+    rows: Annotated[Indices, "b", "k", "<m"]
     radii: Annotated[Array, "b"] | None = None
 
     def __post_init__(self) -> None:
@@ -65,24 +68,24 @@ class Blocks:
             raise RequestError(f"{self.kind.value}s have {'one row' if size != 1 else 'two rows or more'}, not {size}")
         object.__setattr__(self, "rows", read_only(self.rows))
 
-    def parts(self, values: Array) -> tuple[Array, Array]:
+    def parts(self, values: OfRows) -> tuple[Array, Array]:
         """Lengths (b,) of the rows of blocks in values (m,), and of a cone the last row (b,) apart, or the radii."""
         inside = values[self.rows]
         if self.radii is None:
             return np.linalg.norm(inside[:, :-1], axis=1), inside[:, -1]
         return np.linalg.norm(inside, axis=1), self.radii
 
-    def support(self, values: Array) -> Array:
+    def support(self, values: OfRows) -> Array:
         """σ (b,) of values (m,), infinite outside its domain."""
         lengths, limits = self.parts(values)
         return np.where(lengths <= -limits, 0.0, np.inf) if self.radii is None else np.asarray(limits * lengths)
 
-    def gauge(self, lam: Array) -> Array:
+    def gauge(self, lam: OfRows) -> Array:
         """The smallest γ ≥ 0 (b,) with λ (m,) in γ times a block; infinite where there is none."""
         lengths, limits = self.parts(lam)
         return np.where(lengths <= limits, 0.0, np.inf) if self.radii is None else np.asarray(lengths / limits)
 
-    def gap(self, lam: Array, slack: Array, error: Array, unit: float) -> float:
+    def gap(self, lam: OfRows, slack: OfRows, error: OfRows, unit: NotNegative) -> float:
         """An upper bound of the sum of σ(y) − λᵀy, see `DualSet.gap`; `unit` is a round-off of sums of two terms."""
         bounded = self.radii is not None
         own = np.einsum("bk,bk->b", lam[self.rows], slack[self.rows])
@@ -93,7 +96,7 @@ class Blocks:
         away += (4.0 + self.rows.shape[1]) * unit * np.linalg.norm(slack[self.rows], axis=1)
         return float(np.sum(np.maximum(own, 0.0) + reach * away))
 
-    def project(self, values: Array) -> Array:
+    def project(self, values: OfRows) -> Array:
         """The nearest points (b×k) of the blocks, in the Euclidean norm of the rows."""
         inside, (lengths, limits) = values[self.rows], self.parts(values)
         positive = np.where(lengths > 0.0, lengths, 1.0)
@@ -109,7 +112,7 @@ class Blocks:
         return np.column_stack([inside[:, :-1] * share[:, None], height])
 
 
-@constructed
+@bordered
 @dataclass(frozen=True, eq=False)
 class DualSet:
     """The set K of the multipliers of m rows: these blocks, and a ray for every other row."""
@@ -138,44 +141,55 @@ class DualSet:
     def _blocked(self) -> Indices:
         return np.concatenate([block.rows.ravel() for block in self.blocks]) if self.blocks else np.zeros(0, np.intp)
 
-    def rays(self, count: int) -> Mask:
+    @cached_property
+    def _least(self) -> int:
+        return int(self._blocked.max(initial=-1)) + 1
+
+    def _refuse_fewer(self, count: int) -> None:
+        if count < self._least:
+            raise RequestError(f"{count} rows are too few for a dual set with blocks in {self._least}")
+
+    def rays(self, count: Count) -> Mask:
         """Rows (m,) that are rays, of so many."""
+        self._refuse_fewer(count)
         found = np.ones(count, bool)
         found[self._blocked] = False
         return found
 
-    def radii(self, count: int) -> Array:
+    def radii(self, count: Count) -> Array:
         """The c (m,) with |λ| ≤ c of intervals, infinite in all other rows."""
+        self._refuse_fewer(count)
         found = np.full(count, np.inf)
         for block in self.blocks:
             if block.kind is BlockKind.INTERVAL and block.radii is not None:
                 found[block.rows[:, 0]] = block.radii
         return found
 
-    def support(self, values: Array) -> float:
+    def support(self, values: OfRows) -> float:
         """σ_K(y) of y (m,), infinite outside its domain."""
         total = np.inf if values[self.rays(len(values))].max(initial=0.0) > 0.0 else 0.0
         return float(total + sum(float(np.sum(block.support(values))) for block in self.blocks))
 
-    def gauge(self, lam: Array) -> float:
+    def gauge(self, lam: OfRows) -> float:
         """The smallest γ ≥ 0 with λ ∈ γ K for λ (m,); infinite where there is none."""
         largest = np.inf if lam[self.rays(len(lam))].min(initial=0.0) < 0.0 else 0.0
         return float(max([largest, *(float(np.max(block.gauge(lam), initial=0.0)) for block in self.blocks)]))
 
-    def contains(self, lam: Array) -> bool:
+    def contains(self, lam: OfRows) -> bool:
         """Whether λ (m,) is in K, without any round-off; not where one of them is no number."""
         if not self.blocks:
             return not lam.min(initial=0.0) < 0.0
         return bool(self.gauge(lam) <= 1.0)
 
-    def project(self, lam: Array) -> Array:
+    def project(self, lam: OfRows) -> Array:
         """The nearest point (m,) of K to λ, in the Euclidean norm of the rows."""
+        self._refuse_fewer(len(lam))
         found = np.maximum(lam, 0.0)
         for block in self.blocks:
             found[block.rows] = block.project(lam)
         return np.asarray(found)
 
-    def gap(self, lam: Array, slack: Array, round_off: Array | None = None) -> float:
+    def gap(self, lam: OfRows, slack: OfRows, round_off: OfRows | None = None) -> float:
         """An upper bound of σ_K(y) − λᵀy for λ ∈ K and y (m,) = −`slack`, which is feasible where rows are rays.
 
         `round_off` (m,) bounds that of y; without it the bound is the value.
@@ -187,7 +201,7 @@ class DualSet:
         unit = 0.0 if round_off is None else EPS
         return total + sum(block.gap(lam, slack, error, unit) for block in self.blocks)
 
-    def free(self, lam: Array) -> Mask:
+    def free(self, lam: Annotated[Array, "m", "P?"]) -> Mask:
         """Rows inside their blocks, where B u = g: rays with λ > 0, intervals with |λ| < c, for λ (m,) or (m×P)."""
         if not self.blocks:
             return np.asarray(lam > 0.0)
@@ -195,18 +209,15 @@ class DualSet:
         rays, radii = self.rays(count).reshape(count, *columns), self.radii(count).reshape(count, *columns)
         return np.asarray(np.where(rays, lam > 0.0, np.isfinite(radii) & (np.abs(lam) < radii)))
 
-    def of(self, rows: Indices, count: int) -> DualSet:
-        """The set of some rows (k,) of `count`, rising; blocks are in them as a whole, or not at all."""
-        if not self.blocks:
-            return self
-        place = np.full(count, -1, np.intp)
-        place[rows] = np.arange(len(rows))
+    def of(self, rows: Rising) -> DualSet:
+        """The set of some rows (k,), rising; blocks are in them as a whole, or not at all."""
         kept = []
         for block in self.blocks:
-            inside = (place[block.rows] >= 0).all(axis=1)
+            inside = np.isin(block.rows, rows).all(axis=1)
             radii = None if block.radii is None else block.radii[inside]
-            kept += [replace(block, rows=place[block.rows[inside]], radii=radii)] if inside.any() else []
-        return DualSet(tuple(kept))
+            places = np.searchsorted(rows, block.rows[inside])
+            kept += [replace(block, rows=places, radii=radii)] if inside.any() else []
+        return DualSet(tuple(kept)) if self.blocks else self
 
     def names(self) -> str:
         """The kinds of the blocks in words."""

@@ -10,13 +10,13 @@ import numpy as np
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError, in_a_line
-from vibench.signatures import constructed
+from vibench.signatures import bordered, constructed
 
 OutputFunction = Callable[[Array, Array, Array], float]
 """From a parameter mu (d,) and a solution u (n,), λ (m,) to a number."""
 
 
-@constructed
+@bordered
 @dataclass(frozen=True)
 class Output:
     """A quantity of interest s: linear, s = uᵀ`u` + λᵀ`lam`, or else any function of (mu, u, λ).
@@ -46,7 +46,9 @@ class Output:
         """Whether it is linear in u and λ, with coefficients that do not depend on the parameter."""
         return self.u is not None or self.lam is not None
 
-    def values(self, mus: Array, u: Array, lam: Array) -> Array:
+    def values(
+        self, mus: Annotated[Array, "P", "d"], u: Annotated[Array, "n", "P"], lam: Annotated[Array, "m", "P"]
+    ) -> Array:
         """Values (P,) of the output at parameters (P×d) and solutions, columns of u (n×P) and λ (m×P).
 
         Raises a `NumericalError` if coefficients have the wrong shape, the function fails, or a value is not finite.

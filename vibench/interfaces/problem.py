@@ -18,14 +18,15 @@ from vibench.errors import at_parameter
 from vibench.interfaces.absent_rows import settled_bounds, without_infinities
 from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.contact_source import ContactSource
-from vibench.interfaces.dual_sets import RAYS, BlockKind, DualSet
+from vibench.interfaces.dual_sets import RAYS, BlockKind, DualSet, Rising
 from vibench.interfaces.outputs import MeshFields, Output, Picture
 from vibench.interfaces.parameters import ParameterBox
 from vibench.linalg.factorisations import DEFAULT
 from vibench.linalg.inner_product import InnerProduct
-from vibench.signatures import Count, Rule, Seed, bordered, overridden
+from vibench.signatures import Count, Rule, Seed, bordered, guarded, overridden
 
 
+@guarded
 @dataclass(frozen=True)
 class VariationalInequality:
     """u = argmin ½ uᵀA u − fᵀu + σ_K(B u − g) at one parameter, B u ≤ g for rays (paper, equations (1), (2) and (7)).
@@ -62,10 +63,10 @@ class VariationalInequality:
         lift = None if self.dirichlet_lift is None else self.dirichlet_lift.copy()
         return VariationalInequality(self.A.copy(), self.f.copy(), self.B.copy(), self.g.copy(), lift, self.K)
 
-    def kept(self, rows: Indices) -> VariationalInequality:
-        """The same with some rows (k,) of the constraint alone."""
+    def kept(self, rows: Annotated[Rising, "<m"]) -> VariationalInequality:
+        """The same with some rows (k,) of the constraint alone, rising."""
         B = self.B[rows] if isinstance(self.B, np.ndarray) else sp.csr_array(self.B)[rows]
-        return replace(self, B=B, g=self.g[rows], K=self.K.of(rows, len(self.g)))
+        return replace(self, B=B, g=self.g[rows], K=self.K.of(rows))
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,7 @@ Sampler = Callable[[Array], Mapping[str, Array]]
 """From a parameter mu (d,) to the values of chosen entries, by member."""
 
 
+@guarded
 class Problem(ABC):
     """A parametrised variational inequality with its high-fidelity discretisation.
 
@@ -170,8 +172,7 @@ class Problem(ABC):
 
     def __init_subclass__(cls, **named: Any) -> None:
         super().__init_subclass__(**named)
-        # Queries and high-fidelity solutions that are timed call these: a check would take longer.
-        overridden(cls, __name__, "contact", "start", "refuse")
+        overridden(cls, __name__)
 
     @classmethod
     def data_digest(cls, **options: Any) -> str:  # noqa: ARG003
@@ -204,7 +205,7 @@ class Problem(ABC):
         """Contact unknowns: all columns where B(mu) may be non-zero at some mu, rising; `None` if not declared."""
         return None
 
-    def contact(self, mu: Array) -> Contact | None:  # noqa: ARG002
+    def contact(self, mu: OfBox) -> Contact | None:  # noqa: ARG002
         """The constraint at mu (d,) on `contact_dofs`, assembled at that cost alone; `None` if not implemented."""
         return None
 
@@ -217,7 +218,6 @@ class Problem(ABC):
         """Whether the problem defines `contact_dofs` and `contact`."""
         return self.contact_dofs is not None and type(self).contact is not Problem.contact
 
-    @bordered
     def contact_loads(self, eta: Annotated[Array, "m", "k"]) -> ContactLoads:
         """Bᵀη on `contact_dofs` and ηᵀg for multipliers η (m×k), from `contact` where nothing cheaper is known.
 
@@ -257,7 +257,6 @@ class Problem(ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} declares {sorted(self.elementwise)} and has no elements")
 
-    @bordered
     def constraint(self, mu: OfBox) -> tuple[SparseMatrix, Array]:
         """B (m×n) and g (m,) at mu (d,), from `contact` if implemented, else from `assemble`."""
         with at_parameter(mu):

@@ -22,7 +22,7 @@ from vibench.interfaces.outputs import Output, Picture
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.strategies import Enrichment, ReducedSet, Sampling, check_sample
 from vibench.linalg.inner_product import InnerProduct
-from vibench.signatures import check_attributes, inside, refuse_others, rule_of
+from vibench.signatures import check_attributes, refuse_others, rule_of
 
 
 def check_cone(cone: object, W: InnerProduct, K: DualSet = RAYS) -> ReducedSet:
@@ -126,7 +126,7 @@ def checked_assembly(problem: Problem, mu: Annotated[Array, "d"]) -> Variational
     values not real and finite, or out of range.
     """
     with at_parameter(mu):
-        vi = in_float64(inside(problem.assemble)(mu))
+        vi = in_float64(problem.assemble(mu))
     n, m = problem.V.dim, problem.W.dim
     for name, value, shape in (("A", vi.A, (n, n)), ("f", vi.f, (n,)), ("B", vi.B, (m, n)), ("g", vi.g, (m,))):
         if value.shape != shape:

@@ -20,7 +20,6 @@ from vibench.interfaces.problem import MEMBERS, Problem, Sampler
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct, svd
 from vibench.qp.scaling import ratio
-from vibench.signatures import inside
 
 # Tolerance of empirical interpolation where none is given.
 INTERPOLATION_RTOL = 1e-6
@@ -149,7 +148,7 @@ def assembled_members(problem: Problem, mus: Iterable[Array], names: Sequence[st
     assembled: dict[str, list[Any]] = {name: [] for name in names}
     for mu in mus:
         if set(names) <= {"B", "g"}:
-            values = dict(zip(("B", "g"), inside(problem.constraint)(mu), strict=True))
+            values = dict(zip(("B", "g"), problem.constraint(mu), strict=True))
         else:
             vi = checked_assembly(problem, mu)
             values = {name: getattr(vi, name) for name in names}

@@ -211,7 +211,7 @@ class ContactForm:
 
     def correction_system(self, rows: Indices, pressed: Array, least: Array) -> ActiveSetSystem:
         """The systems of min ½‖w‖²_A + ηᵀB w + σ_K(s − B w) for some rows (k,), with η (m,) and s (k,)."""
-        vi, K = self.vi, self.vi.K.of(rows, len(self.vi.g))
+        vi, K = self.vi, self.vi.K.of(rows)
         if not self.is_dense:
             program = VariationalInequality(vi.A, -(vi.B.T @ pressed), -sp.csr_array(vi.B)[rows], -least, K=K)
             return self._stiffness.active_set_system(program)

@@ -16,7 +16,6 @@ from vibench.interfaces.strategies import Enrichment
 from vibench.interfaces.validation import checked_assembly, first_assembly
 from vibench.linalg.inner_product import orthonormal_range
 from vibench.reduction.supremizers import ContactCoordinates, projected_supremizers, proportionality
-from vibench.signatures import inside
 
 
 @dataclass(frozen=True)
@@ -233,7 +232,7 @@ def projected_members(
         if not left:
             return found
         if loads is None or on is None:
-            B, g = inside(problem.constraint)(mu)
+            B, g = problem.constraint(mu)
             evaluated = {"B": of["B"](B), "g": of["g"](g)}
         else:
             varying, bounds = loads.varying(mu)

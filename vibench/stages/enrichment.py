@@ -19,7 +19,6 @@ from vibench.offline.reduction import Reduction
 from vibench.plugins.plugin import Plugin
 from vibench.reduction.nested import Grown, Milestone, grow_through
 from vibench.reduction.supremizers import ConstraintClasses, projected_supremizers
-from vibench.signatures import inside
 from vibench.stability.infsup import ProjectedSupremizers
 from vibench.stages.artefacts import History, Store, storable
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
@@ -156,7 +155,7 @@ class SingleEnrichment(EnrichmentStage):
         offline, strategy = _offline(store, self.pod, self.cone), self.primal.create()
         with faults_of(self.primal):
             given = replace(offline)
-            enrichment, seconds = timed(lambda: inside(strategy.build)(given, self.tolerance))
+            enrichment, seconds = timed(lambda: strategy.build(given, self.tolerance))
             enrichment = check_enrichment(enrichment, offline.problem.V, offline.basis)
         quantities = dict(enrichment.history)
         # The assessment on the training set is not timed.

@@ -11,7 +11,6 @@ from vibench.plugins.plugin import Plugin
 from vibench.reduction.cones import orthogonality
 from vibench.reduction.pod import POD, pod
 from vibench.reduction.supremizers import ConstraintClasses, constraint_classes, isometric_supremizers
-from vibench.signatures import inside
 from vibench.stability.infsup import ConeBasis, beta_span, cone_basis
 from vibench.stages.artefacts import History, Store, storable
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
@@ -85,7 +84,7 @@ class ConeStage(Stage):
         refuse_blocks(K, strategy.blocks, f"the dual strategy '{self.dual.name}'")
         # Verification is no part of the offline time.
         with faults_of(self.dual):
-            cone, reducing = timed(lambda: inside(strategy.reduce)(snapshots, W, replace(self.stop)))
+            cone, reducing = timed(lambda: strategy.reduce(snapshots, W, replace(self.stop)))
             cone = check_cone(cone, W, K)
         prepared, preparing = timed(lambda: cone_basis(cone.generators, W, cone.free))
         orthogonal = orthogonality(cone.generators, W, cone.free)

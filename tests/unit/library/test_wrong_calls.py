@@ -18,7 +18,17 @@ from packs import manifest, write_cable, write_manifest, write_mesh
 from sample_run import write_sample_run
 
 import vibench
-from vibench import NumericalError, RequestError, Stop, UnsupportedError, calibration, reduction, report, stability
+from vibench import (
+    NumericalError,
+    RequestError,
+    Stop,
+    UnsupportedError,
+    calibration,
+    linalg,
+    reduction,
+    report,
+    stability,
+)
 from vibench.library import runs
 
 
@@ -57,11 +67,6 @@ NOT_CALLED = {
     "ExportedModel",
     "FormulationAnswer",
     "HighFidelitySolution",
-    "HighFidelitySolver.condensed",
-    "HighFidelitySolver.remember",
-    "HighFidelitySolver.solve_assembled",
-    "HighFidelitySolver.solve_next",
-    "HighFidelitySolver.verify",
     "MeshFields",
     "Model",
     "Model.answered",
@@ -95,11 +100,10 @@ NOT_CALLED = {
     "styled",
     "summary",
 }
-# Numbers that a figure leaves out, the infinite ones of nothing known; any index; no models; styles of lines, texts.
+# Numbers that a figure leaves out, the infinite ones of nothing known; no models; styles, texts.
 PARTLY_RIGHT = {
-    "Data.interval.bounds", "Decisions.models", "LazyDistances.widen.taken", "Look.dashes", "Looks.series", "Prior.sd",
-    "Series.variant",
-    "constraint_classes.matrices", "plot.x", "plot.y", "scatter.x", "scatter.y", "save.formats",
+    "Data.interval.bounds", "Decisions.models", "Look.dashes", "Looks.series", "Prior.sd",
+    "Series.variant", "constraint_classes.matrices", "plot.x", "plot.y", "scatter.x", "scatter.y", "save.formats",
 }  # fmt: skip
 
 
@@ -126,6 +130,9 @@ def right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     model, solver, sums = phase.model, vibench.HighFidelitySolver(pack), vibench.AffineSum((mu,), np.ones)
     space, few, B = vibench.InnerProduct(sp.eye_array(5)), vibench.InnerProduct(sp.eye_array(3)), sp.eye_array(3, 5)
     vi = vibench.VariationalInequality(sp.eye_array(5, format="csr"), np.ones(5), B.tocsr(), np.ones(3))
+    disc = vibench.Blocks(vibench.BlockKind.DISC, np.array([[0, 1]]), np.ones(1))
+    output, K = vibench.Output("X", "1", u=np.ones(5)), vibench.DualSet((disc,))
+    assembled, two_rows = pack.assemble(mu), np.ones(2)
     own: dict[str, Any] = {f"Study.{name}": value for name, value in STUDY.items()}
     own |= {
         "InnerProduct.gram.u": np.ones((5, 1)), "InnerProduct.gram.v": np.ones((5, 1)), "Reduction.generators": size,
@@ -138,7 +145,11 @@ def right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         "Enrichment.eta": None, "export_vtu.file": "m.vtu", "Run.path": Path("run"),
         "Reduction.enriched.tolerance": None, "Model.solve.tolerance": None, "Model.solve_all.tolerance": None,
         "greedy_cone.snapshots": np.eye(3, 4), "Snapshots.u": np.eye(5, 4), "Snapshots.lam": np.eye(3, 4),
-        "solve_qp.start": None, "HighFidelitySolver.remember.solution": solver.solve(mu), "Offline.generators": size,
+        "solve_qp.start": None, "Offline.generators": size,
+        "HighFidelitySolver.condensed.vi": assembled, "HighFidelitySolver.solve_assembled.vi": assembled,
+        "HighFidelitySolver.solve_next.vi": assembled, "HighFidelitySolver.verify.vi": assembled,
+        "Blocks.gap.error": two_rows, "Blocks.gap.unit": 0.0, "Output.values.mus": np.ones((2, 1)),
+        "Output.values.u": np.ones((5, 2)), "Output.values.lam": np.ones((3, 2)),
         "ParameterBox.units": two, "check_enrichment.basis": phase.pod.basis, "check_enrichment.V": pack.V,
         "mcpg.reduce.snapshots": np.eye(3, 4), "offline-pga.build.offline": phase.offline,
         "offline-pga.build.tolerance": 0.5, "check_cone.W": pack.W,
@@ -147,7 +158,7 @@ def right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         "read_model_pack.path": str(folder), "foreign.kind": RequestError, "foreign.what": "a library",
     }  # fmt: skip
     others, further = of_submodules(model, tmp_path)
-    made = (run, model, phase, space, size, solver, sums, pack.parameters, *others)
+    made = (run, model, phase, space, size, solver, sums, pack.parameters, disc, K, output, vi, *others)
     return own | further | {
         "instances": {type(one): one for one in made},
         "B": B, "V": space, "W": few, "Z": np.eye(pack.V.dim, 2), "accuracy": 1e-8, "alpha": np.zeros(2), "at": {},
@@ -167,7 +178,9 @@ def right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         "seed": 0, "size": 2, "snapshots": np.eye(5, 4), "solver": "piqp", "span": np.eye(3, 2), "stop": size,
         "study": vibench.Study(**STUDY), "terms": (mu,), "theta": np.ones(3), "thetas": np.ones, "tolerance": 1e-8,
         "training": None, "u": np.ones(5), "unit": mu[None], "units": two, "upper": mu + 1.0, "vi": vi, "within": 0.1,
-        "x": np.zeros(2), "y": np.ones(5), "ContactSource.text": "", "ContactSource.tables": {"rows": 2},
+        "x": np.zeros(2), "y": np.ones(5), "lam": two_rows, "slack": two_rows, "values": two_rows, "round_off": None,
+        "solution": solver.solve(mu), "unverified": solver.solve_assembled(mu, assembled),
+        "ContactSource.text": "", "ContactSource.tables": {"rows": 2},
         "ContactSource.entries": 1, "Blocks.kind": vibench.BlockKind.DISC, "Blocks.rows": np.array([[0, 1]]),
         "Blocks.radii": np.ones(1), "DualSet.blocks": (),
     }  # fmt: skip
@@ -286,7 +299,7 @@ def test_every_wrong_argument_is_refused_in_a_line(right: dict[str, Any]) -> Non
 
 def test_messages_name_the_argument_and_what_is_right(tmp_path: Path) -> None:
     run, V = vibench.open_run(write_sample_run(tmp_path)), vibench.InnerProduct(sp.eye_array(5))
-    one, no_number = Stop(size=1), np.full((5, 1), np.nan)
+    one, no_number, K = Stop(size=1), np.full((5, 1), np.nan), vibench.DualSet.intervals(np.array([3]), 1.0)
     for call, words in (
         (lambda: run.write_figures(formats="x"), "formats of Run.write_figures is 'x', expected a sequence of 'png'"),
         (lambda: run.figure("convergence", "membran"), "no problem is called 'membran'; did you mean 'membrane'"),
@@ -307,6 +320,15 @@ def test_messages_name_the_argument_and_what_is_right(tmp_path: Path) -> None:
         (lambda: vibench.export_model(evaluations=0, model=V, file=V), "is 0, expected a whole number of at least 1"),
         (lambda: V.norm(np.ones(4)), "an array of the shape (4,) is not of a space of dimension 5"),
         (lambda: Stop(tolerance="x"), "tolerance of Stop is 'x', expected a number of at least 0"),
+        (lambda: K.project(np.ones(3)), "3 rows are too few for a dual set with blocks in 4"),
+        (lambda: K.blocks[0].support(np.ones(3)), "has the index 3, expected at least 0 and below m = 3"),
+        (lambda: vibench.DualSet.intervals(-np.ones(1, int), 1.0), "of Blocks has the index -1, expected at least 0"),
+        (lambda: reduction.LazyDistances(np.eye(5)).widen(np.eye(5)),
+            "generators without the last of LazyDistances.widen has r = 4, but that of generators in the object is 0"),
+        (lambda: linalg.project_out(np.eye(5, 2), np.ones(4)), "y of project_out has n = 4, but that of space is 5"),
+        (lambda: linalg.project_out(np.eye(5, 2), np.ones((5, 1, 1))), "of the shape (n,) or (n, k)"),
+        (lambda: reduction.supremizer_coordinates(V, np.eye(5), [sp.eye_array(3, 5), sp.eye_array(3, 4)], np.eye(3)),
+            "matrices[1] of supremizer_coordinates has n = 4, but that of V is 5"),
         (lambda: vibench.InnerProduct("x"), "the Gram matrix is 'x', expected a matrix of real numbers"),
     ):  # fmt: skip
         with pytest.raises(RequestError, match=re.escape(words)):

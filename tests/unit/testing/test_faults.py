@@ -52,7 +52,7 @@ FAULTS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "OtherValidation": ("validation set", "not the same for the same seed", "default_rng(seed)"),
         "Unpicklable": ("pickling", "cannot be pickled", "attribute load"),
         "OutOfReach": ("high-fidelity solution", "no solution: at mu = [8.0]", "more than the wire bears"),
-        "PaintsNothing": ("picture and diagnostics", "u of Declared.picture has n = 11, but that of V in self is 12"),
+        "PaintsNothing": ("picture and diagnostics", "has n = 11, but that of V in the object is 12"),
         "InsideOut": ("picture and diagnostics", "mesh_fields.cells['tetra']: 1 of 1 cells are inside out or flat"),
         "OutputsOfOneName": ("spaces", "two outputs have the same name: force"),
         "OutputOfNothing": ("outputs", "the output 'peak' fails at mu = [4.0]: ValueError: zero-size array"),
