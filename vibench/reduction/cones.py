@@ -11,7 +11,7 @@ import scipy.linalg
 from scipy.optimize import nnls
 
 from vibench.arrays import Array, Indices, Mask
-from vibench.errors import NumericalError, RequestError
+from vibench.errors import NumericalError
 from vibench.interfaces.strategies import ReducedSet, Stop, no_free, rays
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
@@ -60,15 +60,9 @@ class LazyMaximum:
         """Apply upper bounds (P,) of the current indicators where they are below the stored ones."""
         self._bounds = np.minimum(self._bounds, bounds)
 
-    def exclude(self, index: Count) -> None:
+    def exclude(self, index: Annotated[Count, "<P"]) -> None:
         """Exclude an index from all later choices."""
-        _refuse_beyond(index, len(self._bounds))
         self._bounds[index] = -np.inf
-
-
-def _refuse_beyond(index: int, count: int) -> None:
-    if index >= count:
-        raise RequestError(f"there is no index {index} among {count}")
 
 
 @dataclass(frozen=True)
@@ -227,6 +221,7 @@ class LazyDistances:
     """
 
     _snapshots: Annotated[Any, "m", "Q"]
+    _generators: Annotated[Any, "m", "r"]
 
     def __init__(self, whitened: Annotated[Array, "m", "Q"]) -> None:
         self._snapshots = whitened
@@ -237,15 +232,11 @@ class LazyDistances:
         self._taken = np.zeros(whitened.shape[1], bool)
         self.maximum = LazyMaximum(norms / self._largest)
 
-    def widen(self, generators: Annotated[Array, "m", "r"], taken: Count | None = None) -> None:
+    def widen(self, generators: Annotated[Array, "m", "r+1"], taken: Annotated[Count | None, "<Q"] = None) -> None:
         """Add the last of the generators (m×r, unit norm, whitened), which is of the snapshot `taken`.
 
         That one is not chosen again if it is in the cone to round-off (paper, Remark 4.1).
         """
-        if generators.shape[1] != (count := len(self._coefficients) + 1):
-            raise RequestError(
-                f"widen is given {generators.shape[1]} generators, expected {count}, the last of them new"
-            )
         old, new = _best_combination(self._generators @ self._coefficients, generators[:, -1], self._snapshots)
         self._coefficients = np.vstack([self._coefficients * old, new])
         self._generators = generators
@@ -258,7 +249,6 @@ class LazyDistances:
         bounds = np.linalg.norm(self._snapshots - generators @ self._coefficients, axis=0) / self._largest
         self.maximum.bound(bounds)
         if taken is not None:
-            _refuse_beyond(taken, len(bounds))
             self._taken[taken] = True
             if bounds[taken] <= TIE:
                 self.maximum.exclude(taken)
@@ -267,9 +257,8 @@ class LazyDistances:
         """Index of the snapshot farthest from the cone, and its distance, those taken excluded."""
         return self.maximum.next(self._distance)
 
-    def residual(self, q: Count) -> Array:
+    def residual(self, q: Annotated[Count, "<Q"]) -> Array:
         """Snapshot minus its stored point of the cone (m,), which is its projection for the index from `next`."""
-        _refuse_beyond(q, self._snapshots.shape[1])
         return np.asarray(self._snapshots[:, q] - self._generators @ self._coefficients[:, q])
 
     def _distance(self, q: int) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix, real_matrix
-from vibench.errors import NumericalError, RequestError
+from vibench.errors import NumericalError
 from vibench.interfaces.problem import ContactLoads
 from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal, Elimination
 from vibench.linalg.factorisations import implementation
@@ -236,14 +236,13 @@ def _loads(B: SparseMatrix, dofs: Indices, eta: Array) -> Array:
 
 def supremizer_coordinates(
     V: Annotated[InnerProduct, "n"], basis: Annotated[Array, "n", "N"],
-    matrices: Annotated[Sequence[SparseMatrix], Rule("at least one matrix", len)], eta: Annotated[Array, "m", "k"],
+    matrices: Annotated[Sequence[Annotated[SparseMatrix, "m", "n"]], Rule("at least one matrix", len)],
+    eta: Annotated[Array, "m", "k"],
 ) -> tuple[Coordinates, list[Array]]:  # fmt: skip
     """Coordinates for greedy algorithms over supremizers, and those (d×k) of T(mu)η for every matrix.
 
     From a V-orthonormal basis of V_N (n×N), constraint matrices B(mu) (m×n) and multipliers η (m×k).
     """
-    if wrong := [B.shape for B in matrices if B.shape != (len(eta), V.dim)]:
-        raise RequestError(f"a constraint matrix has the shape {wrong[0]}, expected {(len(eta), V.dim)}")
     space: Coordinates
     constrained = _constrained_unknowns(matrices)
     if len(constrained) > MANY_UNKNOWNS:  # unknowns that no multiplier loads need no dense work
