@@ -28,7 +28,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 @dataclass(frozen=True)
 class Rule:
-    """Condition on values in words and as a predicate; names of axes, fields or items with some, what indices are of."""
+    """Condition on values in words and as a predicate; names of axes, parts or items with some, the axis of indices."""
 
     right: str
     holds: Callable[[Any], bool]

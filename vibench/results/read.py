@@ -15,7 +15,7 @@ from vibench.results import ranking
 from vibench.results.break_even import Meaning
 from vibench.results.schema import KEYS, STORED, TABLES, VERSION, Column, SqlType, column_of
 from vibench.results.sqlite import FILE, Part, read_meta, read_parts, read_rows
-from vibench.text import json_object, shown
+from vibench.text import brief, json_object, shown
 
 
 def results_file(run: str) -> Path:
@@ -31,7 +31,9 @@ def results_file(run: str) -> Path:
             if schema != str(VERSION):
                 raise RequestError(f"'{path}' has schema {schema}, this vibench reads {VERSION}")
             return path
-    raise RequestError(f"no results in '{run}': expected a folder with {FILE}, as `vibench run` makes under runs/")
+    raise RequestError(
+        f"no results in '{brief(str(run), 300)}': expected a folder with {FILE}, as `vibench run` makes under runs/"
+    )
 
 
 def read_table(path: Path, table: str, cells: Sequence[str] = ()) -> pd.DataFrame:

@@ -18,7 +18,7 @@ from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
 from vibench.results.schema import STORED, Column, column_of
 from vibench.results.sqlite import of_cells, open_read_only
-from vibench.text import printable
+from vibench.text import brief, printable
 
 
 def matching(
@@ -139,7 +139,7 @@ def key_of(cell: str, keys: Iterable[str], run: str, command: str = "vibench sho
     """The one key of a cell that begins with `cell`; a `RequestError` if there is none, or are several."""
     matching = [key for key in keys if key.startswith(cell)]
     if len(matching) != 1:
-        said = f"{len(matching)} cells of '{run}' begin with '{cell}', expected one"
+        said = f"{len(matching)} cells of '{run}' begin with '{brief(cell, 80)}', expected one"
         raise RequestError(f"{said}; `{command}` lists them")
     return matching[0]
 

@@ -57,6 +57,9 @@ def test_a_wrong_request_is_refused_in_one_line(main: Main, quick_run: Path, tmp
         (["show", "/".join(["d" * 100] * 6)], ["no results in"]), (["list", "x" * 5000], ["x… (5000 characters)'"]),
     ):  # fmt: skip
         refused(main(*arguments), *words)
+    run, long = str(quick_run), "x" * 5000
+    for named in (["show", run, long], ["show", long], ["replay", run, long], ["compare", run, long]):
+        assert len(refused(main(*named), "x… (5000 characters)'")) < 500 + len(run), named
     assert list(Path.cwd().iterdir()) == []
     in_place = STUDY | {"tolerances": {"pod": [0.01], "dual": [0.1]}}
     for content, words in (

@@ -135,6 +135,25 @@ def test_systems_that_cannot_be_regular_are_not_factorised(
     assert len(factorised) < 15
 
 
+@pytest.mark.parametrize("dense", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_four_times_as_many_rows_as_unknowns_are_solved_or_refused(dense: bool) -> None:
+    """The sizes at which the interpreter aborted, or hung; in full matrices it takes ten seconds each."""
+    vi, one = string(400, 0.0, 40.0), sp.eye_array(400, format="csr")
+    with pytest.raises(NumericalError, match=OPPOSITE):
+        active_set.solve_high_fidelity(replace(vi, B=sp.vstack([one, -one], format="csr"), g=-np.ones(800)))
+    sparse = sp.vstack([one, -2.0 * one, one + sp.eye_array(400, k=1), one - sp.eye_array(400, k=1)])
+    B = sp.csr_array(np.random.default_rng(0).standard_normal((1600, 400)) if dense else sparse)
+    with pytest.raises(NumericalError, match=NONE if dense else OPPOSITE):
+        active_set.solve_high_fidelity(replace(vi, B=B, g=-np.ones(1600)))
+    found = active_set.solve_high_fidelity(replace(vi, B=B, g=(g := np.full(1600, 0.1))))
+    room = g - B @ found.u
+    assert room.min() >= -1e-12
+    assert found.lam.min() >= 0.0
+    assert found.lam.max() > 0.0
+    assert abs(found.lam @ room) <= 1e-10 * found.lam.max()
+    assert np.abs(vi.A @ found.u + B.T @ found.lam - vi.f).max() <= 1e-10 * np.abs(vi.f).max()
+
+
 def test_a_contact_set_that_moves_node_by_node_is_followed_to_its_end() -> None:
     """A soft rope on hills, every node of which is constrained: after Haasdonk, Salomon and Wohlmuth (2012)."""
     half = 320

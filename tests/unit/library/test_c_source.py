@@ -1,6 +1,7 @@
 """Exported C sources, compiled: they answer as the models do, whatever the constraints are like."""
 
 import ctypes
+import re
 import shutil
 import subprocess
 import warnings
@@ -486,6 +487,26 @@ def test_loaded_ties_hide_no_contact_from_c_and_scripts(share: float, tmp_path: 
         expected = kkt_residuals(vibench.VariationalInequality(A, load, B, g), x, alpha)
         script = reduced_model.residuals(of, load, g / rows, x, rows * alpha, none)
         assert script == pytest.approx((expected.primal, expected.dual, expected.gap), rel=1e-9)
+
+
+def test_numbers_of_a_source_that_are_not_finite_are_a_failure(tmp_path: Path) -> None:
+    """Those of a damaged or forged source, table by table."""
+    members = {name: linear(np.ones(1), {0: 0}, 1) for name in "AfBg"}
+    arrays = {"lower": -np.ones(1), "upper": np.ones(1), "start_factor": np.ones(1)}
+    text = c_source.source(members, arrays, about(["t"]), "model")[0]
+    (tmp_path / "model.c").write_text(re.sub("static const (?=double|float)", "", text), encoding="utf-8")
+    solve = compiled(tmp_path / "model.c", 1, 1)
+    tables = ctypes.CDLL(str(tmp_path / "model.so"))
+    for table in (*(f"{name}_single_terms" for name in "AfBg"), "factor"):
+        number = (ctypes.c_double if table == "factor" else ctypes.c_float).in_dll(tables, table)
+        right = number.value
+        for wrong in (np.nan, np.inf, -np.inf):
+            assert solve(np.zeros(1))[0] == 0
+            number.value = wrong
+            code, *numbers = solve(np.zeros(1))
+            assert code == 3, (table, wrong)
+            assert np.isnan(np.concatenate(numbers)).all()
+            number.value = right
 
 
 def test_matrices_that_are_not_positive_definite_and_numbers_that_are_not_finite_fail(tmp_path: Path) -> None:
