@@ -5,15 +5,25 @@ import os
 import shutil
 import signal
 import time
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
+from fake_plugins import Wire
 from forking import forked
 from running import PATIENCE, Main, Vibench, read_until, rows, run_wire, started, without_seconds, workers
 from samples import ROUNDS, wire_study, write_study
 
+import vibench
+from vibench.execution.run import Observer, Options, run_study
 from vibench.results import read
+from vibench.results.database import ResultsDatabase
+from vibench.stages.artefacts import Store
+from vibench.study.cells import Cell
 
 RUN = ("run", "study.toml", "--jobs", "2", "--no-figures")
 
@@ -51,6 +61,42 @@ def test_a_run_resumes(kill: signal.Signals, code: int, plugins_folder: Path, vi
     assert all(row["online_s"] > 0.0 and row["timing_rounds"] == ROUNDS for row in after)
     assert [(row["dual"], row["status"]) for row in after] == [("cpg", "ok"), ("cone-waits", "ok")]
     assert len(rows(folder, "queries")) == 6
+
+
+class Watch(Observer):
+    """Interrupts a run as soon as a number of cells have their rows."""
+
+    def __init__(self, last: int) -> None:
+        self.cells, self.last = list[str](), last
+
+    def cell(self, cell: Cell, row: Mapping[str, Any]) -> None:
+        self.cells.append(cell.key)
+        if len(self.cells) == self.last:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.long
+def test_a_thousand_cells_are_resumed_beside_a_thousand_that_are_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As above for two. Artefacts read and transactions written are counted: a clock would measure the machine."""
+    accuracies, counts = np.geomspace(1e-4, 1e-9, 1000).tolist(), Counter[str]()
+    problem, tolerances = {"name": Wire, "options": {"nodes": 4}}, {"pod": [1e-1, 1e-3], "dual": [1e-1]}
+    study = vibench.Study(
+        **wire_study(problem=[problem], tolerances=[tolerances], accuracy=accuracies, validation=1, timing_rounds=1)
+    )
+    for kind, name in ((Store, "get"), (Store, "put"), (ResultsDatabase, "_writing")):
+        plain = getattr(kind, name)
+        monkeypatch.setattr(kind, name, lambda *a, _=(plain, name), **b: counts.update([_[1]]) or _[0](*a, **b))
+    spent, watches = [], (Watch(1000), Watch(1000))
+    for watch, missing in zip(watches, (1000, 0), strict=True):
+        counts.clear()
+        result = run_study(study, tmp_path / "run", watch, Options(2, False, False, "local", None, 1))
+        assert (result.interrupted, result.missing, len(result.rows)) == (True, missing, 2000 - missing)
+        spent.append(counts.total())
+    assert len({*watches[0].cells, *watches[1].cells}) == 2000
+    assert spent[0] < 1.2 * 1000
+    assert spent[1] < 1.2 * 2000
 
 
 def test_workers_do_not_see_ctrl_c(command: str, plugins_folder: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from running import Vibench, rows
+from running import Vibench, rows, run_wire
 from samples import wire_study, write_study
 
 from vibench.provenance import solver_version
@@ -138,6 +138,17 @@ def test_a_plugin_that_misbehaves_costs_its_cells_alone_and_is_named(cells: pd.D
         if plugin in BAD_SOLVERS:
             assert set(mine["queries_ok"]) == {0}
             assert mine["online_s"].isna().all()
+
+
+@pytest.mark.long
+def test_a_large_problem_that_finds_no_memory_costs_its_cell_alone(vibench: Vibench, tmp_path: Path) -> None:
+    """Not one allocation of a plugin that takes it all: those of libraries, under a limit that suffices for others."""
+    large = {"name": "hertz3d", "options": {"resolution": "coarse"}}
+    tolerances, limits = [{"N": [2], "R": [2]}], {"memory_gib": 0.8}
+    study = wire_study(problem=["radial-obstacle", large], tolerances=tolerances, limits=limits, validation=2)
+    _, (other, row) = run_wire(vibench, tmp_path, study=study)
+    assert (other["status"], row["status"]) == ("ok", "error")
+    assert row["reason"] == "in high-fidelity solutions: out of memory: the limit is memory_gib = 0.8"
 
 
 def test_queries_that_went_well_before_the_solver_died_are_kept(vibench: Vibench, tmp_path: Path) -> None:
