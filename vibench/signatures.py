@@ -70,6 +70,7 @@ def bordered(
 
     @functools.wraps(called)
     def call(*given: Any, **named: Any) -> Any:
+        # By the module of the caller: a check takes longer than many a method.
         if not (outside and sys._getframe(1).f_globals.get("__name__", "").startswith("vibench.")):
             signature().check(given, named)
         return called(*given, **named)

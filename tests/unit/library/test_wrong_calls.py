@@ -18,17 +18,7 @@ from packs import manifest, write_cable, write_manifest, write_mesh
 from sample_run import write_sample_run
 
 import vibench
-from vibench import (
-    NumericalError,
-    RequestError,
-    Stop,
-    UnsupportedError,
-    calibration,
-    linalg,
-    reduction,
-    report,
-    stability,
-)
+from vibench import NumericalError, RequestError, Stop, UnsupportedError, calibration, reduction, report, stability
 from vibench.library import runs
 
 
@@ -325,8 +315,8 @@ def test_messages_name_the_argument_and_what_is_right(tmp_path: Path) -> None:
         (lambda: vibench.DualSet.intervals(-np.ones(1, int), 1.0), "of Blocks has the index -1, expected at least 0"),
         (lambda: reduction.LazyDistances(np.eye(5)).widen(np.eye(5)),
             "generators without the last of LazyDistances.widen has r = 4, but that of generators in the object is 0"),
-        (lambda: linalg.project_out(np.eye(5, 2), np.ones(4)), "y of project_out has n = 4, but that of space is 5"),
-        (lambda: linalg.project_out(np.eye(5, 2), np.ones((5, 1, 1))), "of the shape (n,) or (n, k)"),
+        (lambda: vibench.linalg.project_out(np.eye(5, 2), np.ones(4)), "has n = 4, but that of space is 5"),
+        (lambda: vibench.linalg.project_out(np.eye(5, 2), np.ones((5, 1, 1))), "of the shape (n,) or (n, k)"),
         (lambda: reduction.supremizer_coordinates(V, np.eye(5), [sp.eye_array(3, 5), sp.eye_array(3, 4)], np.eye(3)),
             "matrices[1] of supremizer_coordinates has n = 4, but that of V is 5"),
         (lambda: vibench.InnerProduct("x"), "the Gram matrix is 'x', expected a matrix of real numbers"),
