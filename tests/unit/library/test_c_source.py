@@ -498,8 +498,7 @@ def test_numbers_of_a_source_that_are_not_finite_are_a_failure(tmp_path: Path) -
     solve = compiled(tmp_path / "model.c", 1, 1)
     tables = ctypes.CDLL(str(tmp_path / "model.so"))
     for table in (*(f"{name}_single_terms" for name in "AfBg"), "factor"):
-        number = (ctypes.c_double if table == "factor" else ctypes.c_float).in_dll(tables, table)
-        right = number.value
+        right = (number := (ctypes.c_double if table == "factor" else ctypes.c_float).in_dll(tables, table)).value
         for wrong in (np.nan, np.inf, -np.inf):
             assert solve(np.zeros(1))[0] == 0
             number.value = wrong
