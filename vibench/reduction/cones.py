@@ -254,7 +254,7 @@ class LazyDistances:
                 self.maximum.exclude(taken)
 
     def next(self) -> tuple[int, float]:
-        """Index of the snapshot farthest from the cone, and its distance, those taken excluded."""
+        """Index of the snapshot farthest from the cone, and its distance; −inf if all were taken."""
         return self.maximum.next(self._distance)
 
     def residual(self, q: Annotated[Count, "<Q"]) -> Array:
