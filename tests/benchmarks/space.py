@@ -22,10 +22,10 @@ from dataclasses import replace
 import numpy as np
 
 import vibench
+from vibench import solve_qp
 from vibench.model.bound_terms import CorrectionMode
 from vibench.offline.assemblies import Assemblies
 from vibench.offline.reduction import high_fidelity_sweep
-from vibench.qp.solve import solve_qp
 from vibench.stages.assessment import is_violated
 
 TRAINING, SIZE, UNTIMED = (2, 2, 2, 3), 14, 20

@@ -14,7 +14,7 @@ from running import Main, Vibench, rows
 from sample_run import write_sample_run
 from samples import wire_study, write_study
 
-from vibench.library.runs import Run
+from vibench import Run
 from vibench.report import site as folder
 from vibench.results.sqlite import FILE
 

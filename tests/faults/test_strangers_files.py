@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 from running import PATIENCE, execute
 
+from vibench import NumericalError, RequestError
 from vibench.cli.result_commands import export, replay_query, show, write_report
-from vibench.errors import NumericalError, RequestError
 from vibench.execution.recording import REPORT, claimed
 from vibench.files import locked, write_atomically
 from vibench.report import figures

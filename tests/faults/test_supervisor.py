@@ -16,12 +16,12 @@ import pytest
 from fake_stages import InItems, OfAPlugin, Whole
 from running import PATIENCE
 
+from vibench import Status
 from vibench.execution import supervisor
 from vibench.execution.supervisor import Begun, CurrentItem, Job, StoppedError, Supervisor
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
-from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Stage, Unstored
 

@@ -12,7 +12,7 @@ import fake_plugins
 import pandas as pd
 
 import vibench
-from vibench.interfaces.strategies import Stop
+from vibench import Stop
 from vibench.plugins.plugin import Plugin
 from vibench.results.schema import STORED
 from vibench.stages.artefacts import Artefact, Store

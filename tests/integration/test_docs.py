@@ -27,14 +27,13 @@ from running import Main, Register, Vibench, rows, succeeded
 from samples import toml
 
 import vibench
+from vibench import RequestError, read_study
 from vibench.cli.main import app
-from vibench.errors import RequestError
 from vibench.execution import run as execution
 from vibench.execution.timing_plan import OfflinePlan, TimingPlan
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
 from vibench.results import formats, schema
-from vibench.study.matrix import read_study
 from vibench.study.spec import Entry, Limits, ProblemEntry, SamplingEntry, Study, ToleranceTable
 from vibench.testing import check
 

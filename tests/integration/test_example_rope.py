@@ -14,7 +14,7 @@ from running import Vibench
 from samples import ROUNDS, write_study
 from sources import SOURCES, mentions
 
-from vibench.interfaces.problem import MEMBERS
+from vibench import MEMBERS
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 

@@ -11,14 +11,13 @@ from hypothesis import strategies as st
 from numerics import Varying, space
 from samples import SampleStore, carry_out, program_queries
 
-from vibench import Enrichment, Kind, ReducedSet, Status, Stop, VariationalInequality
+from vibench import Enrichment, Kind, ReducedSet, Status, Stop, VariationalInequality, solve_qp
 from vibench.highfidelity import active_set
 from vibench.model.galerkin import ReducedModel
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
-from vibench.qp.solve import solve_qp
-from vibench.qp.verification import kkt_residuals, verify
+from vibench.qp import kkt_residuals, verify
 from vibench.reduction.cones import orthogonality, project_on_cone
 from vibench.results.consistency import violations
 from vibench.results.schema import STORED

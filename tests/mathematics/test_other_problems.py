@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from other_problems import Block, Put, Torsion
 
-from vibench import HighFidelitySolver, Status
-from vibench.qp.solve import solve_qp
-from vibench.qp.verification import verify
+from vibench import HighFidelitySolver, Status, solve_qp
+from vibench.qp import verify
 
 
 def test_a_bar_is_elastic_until_its_sides_yield() -> None:

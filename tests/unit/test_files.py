@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.files import locked, scratch
 
 

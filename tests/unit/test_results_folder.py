@@ -18,9 +18,8 @@ from PIL import Image
 from running import Changed
 
 from vibench.execution.recorded_cell import recorded_study
-from vibench.report import html, site
+from vibench.report import Sheet, html, site, styled
 from vibench.report.citation import Citation
-from vibench.report.figures.style import Sheet, styled
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 from vibench.study.matrix import expand

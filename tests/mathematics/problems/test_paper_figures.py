@@ -12,8 +12,8 @@ import pytest
 from matplotlib.axes import Axes
 from running import Changed, execute
 
-from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.report.figures.data import ProblemTables, problem_tables
+from vibench import HighFidelitySolver
+from vibench.report import ProblemTables, problem_tables
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 from vibench_problems.hertz import Hertz

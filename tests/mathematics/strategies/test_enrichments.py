@@ -24,12 +24,12 @@ from vibench import (
     no_free,
 )
 from vibench.errors import RequestError
-from vibench.linalg.inner_product import orthonormal_range, project_out, singular_values
-from vibench.reduction.cones import LazyMaximum
+from vibench.linalg import orthonormal_range, project_out, singular_values
+from vibench.reduction import LazyMaximum
 from vibench.reduction.nested import NestedStrategy, grow_through
 from vibench.reduction.pod import pod
 from vibench.reduction.supremizers import supremizers
-from vibench.stability.infsup import cone_basis, inf_sup_full, inf_sup_on
+from vibench.stability import cone_basis, inf_sup_full, inf_sup_on
 from vibench.testing import check
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle

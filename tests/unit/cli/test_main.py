@@ -13,12 +13,12 @@ import pytest
 from running import Main, Register, refused, succeeded
 from samples import STUDY, changed, write_study
 
+from vibench import Status
 from vibench.cli.main import explained_words, renamed
 from vibench.plugins import kinds, registry
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import find, registered
 from vibench.qp.settings import SETTINGS
-from vibench.qp.status import Status
 from vibench.report.differences import ChangeKind
 from vibench.results.break_even import Meaning
 from vibench.results.ranking import added_columns

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from running import Main, Vibench, refused, rows, succeeded
 from samples import wire_study, write_study
 
-from vibench import HighFidelitySolver, create
+from vibench import HighFidelitySolver, RequestError, create
 from vibench.cli import scaffold
-from vibench.errors import RequestError
 from vibench.plugins.kinds import CHECKED, PluginKind
 from vibench.plugins.registry import registered
 from vibench.testing.checks import case_of

@@ -27,6 +27,7 @@ from running import PATIENCE, Main, Vibench, assert_same_numbers, read_until, re
 from samples import wire_study, write_study
 from template import TEMPLATE, template
 
+from vibench import Study
 from vibench.errors import ExecutorError, RequestError
 from vibench.execution import executors
 from vibench.execution.executors import Dask, Local
@@ -34,7 +35,6 @@ from vibench.execution.run import Observer, Options, run_study
 from vibench.execution.supervisor import Job
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Stage
-from vibench.study.spec import Study
 
 
 def elsewhere(_: str) -> tuple[bool, str, str]:

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from samples import SOLVERS_OF_TESTS
 
+from vibench import Status, solve_qp
 from vibench.cli.doctor import wire
 from vibench.execution.isolated import Trial, solver_trials
 from vibench.plugins import registry
-from vibench.qp.solve import solve_qp
-from vibench.qp.status import Status
 
 
 def attempts(solvers: Sequence[str], seconds: float = 60.0) -> dict[str, Trial]:

@@ -11,7 +11,7 @@ import pytest
 from samples import STUDY as FULL_STUDY
 from samples import cell_row, changed, write_study
 
-from vibench.errors import RequestError
+from vibench import RequestError, Stop
 from vibench.execution import recording
 from vibench.execution.recording import (
     axis_columns,
@@ -22,7 +22,6 @@ from vibench.execution.recording import (
     labels_of,
     refute,
 )
-from vibench.interfaces.strategies import Stop
 from vibench.results.database import ResultsDatabase
 from vibench.results.schema import KEYS, STORED
 from vibench.results.sqlite import FILE

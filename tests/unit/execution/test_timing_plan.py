@@ -10,9 +10,9 @@ import pytest
 from counting import growth
 from samples import SampleStore, carry_out, cell_row, query_rows
 
+from vibench import Status
 from vibench.execution.recording import ResultWriter, labels_of
 from vibench.execution.timing_plan import OfflinePlan, TimingPlan, block_sizes
-from vibench.qp.status import Status
 from vibench.results.break_even import scatter
 from vibench.results.database import ResultsDatabase
 from vibench.stages import timing_rounds

@@ -10,9 +10,8 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vibench import AffineProblem, AffineSum, Array, HighFidelitySolver, InnerProduct, ParameterBox
+from vibench import AffineProblem, AffineSum, Array, HighFidelitySolver, InnerProduct, ParameterBox, is_absent
 from vibench.errors import NumericalError, RequestError
-from vibench.interfaces.absent_rows import is_absent
 from vibench.interfaces.affine import CONSTANTS, FUNCTIONS, Expression, Theta
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.affine import Evaluation, affine_decomposition

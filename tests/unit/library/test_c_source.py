@@ -17,10 +17,8 @@ import scipy.sparse.linalg
 from samples import small_study, with_ways
 
 import vibench
-from vibench.interfaces.affine_problem import AffineProblem
-from vibench.interfaces.outputs import Output
+from vibench import AffineProblem, Output, export_model
 from vibench.library import reduced_model
-from vibench.library.export import export_model
 from vibench.library.reduced_model import Model as Exported
 from vibench.model.certificates import contact_correction as complementarity
 from vibench.model.certificates.base import Guarantee

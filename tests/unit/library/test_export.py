@@ -20,8 +20,8 @@ from running import Main, refused, succeeded
 from samples import with_ways
 
 import vibench
+from vibench import export_model
 from vibench.library import reduced_model
-from vibench.library.export import export_model
 from vibench.library.reduced_model import Model as Exported
 from vibench.model.affine import affine_decomposition
 from vibench.model.certificates.base import Guarantee

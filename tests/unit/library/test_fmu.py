@@ -10,10 +10,7 @@ import pytest
 import scipy.sparse as sp
 
 import vibench
-from vibench.errors import RequestError
-from vibench.interfaces.affine_problem import AffineProblem
-from vibench.interfaces.outputs import Output
-from vibench.library.export import export_model
+from vibench import AffineProblem, Output, RequestError, export_model
 from vibench.model.bound_terms import CorrectionMode
 
 fmpy = pytest.importorskip("fmpy")

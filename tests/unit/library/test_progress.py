@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from rich.console import Console
 from samples import STUDY, changed, write_study
 
+from vibench import Stop
 from vibench.execution.graph import Graph
 from vibench.execution.run import Agenda
-from vibench.interfaces.strategies import Stop
 from vibench.library.progress import DrawingDisplay, ProgressDisplay, TimeLeft, duration
 from vibench.plugins.plugin import Plugin
 from vibench.stages.base import Stage

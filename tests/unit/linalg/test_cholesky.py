@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import spd
 
-from vibench.errors import NumericalError
+from vibench import NumericalError
 from vibench.linalg import cholesky
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
 from vibench.linalg.definite import BlockDiagonal, connected_blocks

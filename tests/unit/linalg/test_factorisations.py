@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from vibench.errors import NumericalError, RequestError
+from vibench import NumericalError, RequestError
 from vibench.linalg.factorisations import IMPLEMENTATIONS, Implementation, implementation
 from vibench.linalg.proofs import is_proved_definite
 

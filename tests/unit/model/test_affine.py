@@ -8,9 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import Varying, spd
 
-from vibench.errors import NumericalError
-from vibench.interfaces.affine import AffineSum
-from vibench.interfaces.problem import MEMBERS, Contact, VariationalInequality
+from vibench import MEMBERS, AffineSum, Contact, NumericalError, VariationalInequality
 from vibench.model.affine import Evaluation, affine_decomposition, coefficients, decomposed, held_out_error, interpolate
 
 NEW = np.array([0.37])

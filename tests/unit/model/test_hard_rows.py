@@ -8,10 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import spd
 
-from vibench.highfidelity.active_set import solve_high_fidelity
+from vibench import InnerProduct, VariationalInequality, solve_high_fidelity
 from vibench.highfidelity.kkt_systems import CondensedStiffness
-from vibench.interfaces.problem import VariationalInequality
-from vibench.linalg.inner_product import InnerProduct
 from vibench.model.bound_terms import BoundNote, Equalities
 from vibench.model.error_bounds import bound_errors_at, corrected_pair
 from vibench.model.errors import EnergyNorm

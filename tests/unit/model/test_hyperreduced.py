@@ -15,21 +15,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import Varying
 
-from vibench.errors import NumericalError
-from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.affine import AffineSum
+from vibench import AffineSum, HighFidelitySolver, NumericalError, Status, checked_assembly, solve_qp, supremizers
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.strategies import Enrichment, Kind
-from vibench.interfaces.validation import checked_assembly
-from vibench.linalg.inner_product import singular_values
+from vibench.linalg import singular_values
 from vibench.model.affine import Evaluation, affine_decomposition
 from vibench.model.galerkin import ReducedModel, project
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce, reason_for_full_assembly
 from vibench.qp import verification
-from vibench.qp.solve import solve_qp
-from vibench.qp.status import Status
-from vibench.reduction.supremizers import supremizers
-from vibench.stability.infsup import cone_basis
+from vibench.stability import cone_basis
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 

@@ -10,8 +10,7 @@ from hypothesis.extra.numpy import arrays
 from samples import with_ways
 
 import vibench
-from vibench.errors import NumericalError, RequestError
-from vibench.interfaces.outputs import Output
+from vibench import NumericalError, Output, RequestError
 from vibench.model.certificates.base import output_weights
 from vibench.model.certificates.bounds import OnlineBound, output_error_bound
 from vibench.model.errors import ReferenceSolutions, output_errors, output_scales, summarise_outputs

@@ -8,7 +8,7 @@ import pytest
 from samples import SMALL, small_study, with_ways
 
 import vibench
-from vibench.interfaces.problem import MEMBERS
+from vibench import MEMBERS
 from vibench.interfaces.validation import validation_parameters
 from vibench.model.bound_terms import BoundNote
 from vibench.model.galerkin import ReducedProblem

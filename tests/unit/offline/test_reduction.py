@@ -8,7 +8,7 @@ import pytest
 from samples import SMALL, with_ways
 
 import vibench
-from vibench.errors import UnsupportedError
+from vibench import UnsupportedError
 
 PROBLEM = {"name": "radial-obstacle", "options": {"resolution": 200}}
 

@@ -19,10 +19,8 @@ from packs import SIZE, Cable, manifest, write_arrays, write_cable, write_manife
 from running import Main
 from samples import write_study
 
-from vibench.errors import RequestError
-from vibench.packs import reader
-from vibench.packs.checks import read_model_pack
-from vibench.study.matrix import read_study
+from vibench import RequestError, read_study
+from vibench.packs import read_model_pack, reader
 
 Content = dict[str, Any]
 Mistake = Callable[[Cable, Path], Content]

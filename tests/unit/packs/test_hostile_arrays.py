@@ -14,7 +14,7 @@ import pytest
 from packs import Cable as Arrays
 from packs import manifest, write_cable, write_manifest
 
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.packs import read_model_pack
 
 N = 12

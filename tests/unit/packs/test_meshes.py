@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from packs import manifest, write_cable, write_manifest, write_mesh
 
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.packs import pack_digest, read_model_pack
 from vibench.packs.meshes import read_mesh
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from packs import SIZE, manifest, write_cable, write_manifest
 
-from vibench import create
-from vibench.errors import RequestError
+from vibench import RequestError, create
 from vibench.packs import read_model_pack
 from vibench.packs.writer import write_pack
 

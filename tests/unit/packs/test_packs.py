@@ -18,18 +18,12 @@ from packs import DEPTH, SIZE, Cable, group, manifest, write_arrays, write_cable
 from running import Main
 from samples import write_study
 
-from vibench.errors import NumericalError, RequestError
+from vibench import MEMBERS, NumericalError, RequestError, VariationalInequality, checked_assembly, create, read_study
 from vibench.highfidelity.active_set import HighFidelitySolver, solve_high_fidelity
 from vibench.interfaces.absent_rows import ABSENT
-from vibench.interfaces.problem import MEMBERS, VariationalInequality
-from vibench.interfaces.validation import checked_assembly
-from vibench.packs import writer
-from vibench.packs.checks import read_model_pack
+from vibench.packs import pack_digest, read_model_pack, writer
 from vibench.packs.pack import ModelPack, reduce_multipliers
-from vibench.packs.reader import pack_digest
 from vibench.plugins.plugin import Plugin
-from vibench.plugins.registry import create
-from vibench.study.matrix import read_study
 from vibench.testing.problems import continuity
 from vibench_problems.tresca import Tresca
 

@@ -20,7 +20,7 @@ import pytest
 from fake_plugins import Wire
 
 import vibench
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.execution.isolated import recall_reads, watch_first_use
 from vibench.execution.supervisor import Supervisor
 from vibench.plugins import plugin as module

@@ -16,13 +16,11 @@ from annotated_types import Ge, Gt, Le, Lt, MinLen
 from running import Register
 from samples import FAKES, install
 
-from vibench.errors import RequestError
-from vibench.interfaces.strategies import DualStrategy
+from vibench import DualStrategy, RequestError, read_study
 from vibench.plugins import registry
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find, registered
-from vibench.study.matrix import read_study
 from vibench.study.spec import Entry
 
 HERE = __name__

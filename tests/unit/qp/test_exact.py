@@ -8,11 +8,10 @@ import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vibench.interfaces.problem import VariationalInequality
+from vibench import VariationalInequality, solve_qp
+from vibench.qp import kkt_residuals
 from vibench.qp.exact import exact_solution, rows_that_matter
 from vibench.qp.scaling import size
-from vibench.qp.solve import solve_qp
-from vibench.qp.verification import kkt_residuals
 
 
 def program(seed: int, n: int, m: int, scale: float = 1.0) -> VariationalInequality:

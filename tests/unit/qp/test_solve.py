@@ -11,13 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import exact, spd
 
-from vibench.errors import NumericalError
-from vibench.interfaces.problem import VariationalInequality
+from vibench import NumericalError, QPSolution, Status, VariationalInequality
 from vibench.qp import solve, verification
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import DIRECT, installed_solvers, solve_qp
-from vibench.qp.status import Status
-from vibench.qp.verification import QPSolution
 from vibench.text import LONGEST
 
 seeds = st.integers(0, 10_000)

@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 from running import DECIDED, Changed, Main, execute, succeeded
 
+from vibench import RequestError
 from vibench.cli.result_commands import compare_runs
-from vibench.errors import RequestError
 from vibench.provenance import PROTOCOL
 from vibench.report.comparison import Comparison, compare
 from vibench.report.differences import ChangeKind, agreement, compared_runs

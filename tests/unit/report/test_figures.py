@@ -21,17 +21,15 @@ from matplotlib.lines import Line2D
 from PIL import Image
 from running import DECIDED, Changed, Main, execute
 
-from vibench.errors import RequestError
-from vibench.report import figures
+from vibench import RequestError, read_study
+from vibench.report import figures, save, styled
 from vibench.report.figures import KINDS, answer_sheet, draw_all, effectivity, spaces
 from vibench.report.figures import problem_tables as of_file
 from vibench.report.figures.data import ProblemTables, _per_combination
-from vibench.report.figures.style import save, styled
 from vibench.report.html import page as report_page
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 from vibench.results.verdict import verdicts
-from vibench.study.matrix import read_study
 
 Drawn = dict[str, Figure]
 

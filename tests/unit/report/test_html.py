@@ -14,7 +14,7 @@ from markupsafe import escape
 from outputs import Links, clean, elements
 from running import Changed, Main
 
-from vibench.library.runs import Run
+from vibench import Run
 from vibench.report import html
 from vibench.report.findings import findings
 from vibench.report.plots import short

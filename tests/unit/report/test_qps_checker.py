@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import spd
 
-from vibench.interfaces.problem import VariationalInequality
-from vibench.qp.verification import kkt_residuals
+from vibench import VariationalInequality
+from vibench.qp import kkt_residuals
 from vibench.report.qps_checker import residuals
 
 

@@ -14,8 +14,8 @@ from running import Vibench, run_of
 from typer.testing import CliRunner
 
 import vibench
+from vibench import RequestError
 from vibench.cli.main import app
-from vibench.errors import RequestError
 from vibench.execution.recorded_cell import RecordedCell, recorded_cell, recorded_cells
 from vibench.plugins import registry
 from vibench.qp import verification

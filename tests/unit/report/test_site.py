@@ -17,7 +17,7 @@ from outputs import Links, clean, elements
 from running import Changed, Main, execute, refused, succeeded
 from selenium.webdriver import Chrome
 
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.report import html
 from vibench.report import site as folder
 from vibench.report.citation import Citation, requirements

@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import spd
 
-from vibench.interfaces.problem import VariationalInequality
+from vibench import VariationalInequality, solve_qp
 from vibench.qp import verification
-from vibench.qp.solve import solve_qp
 from vibench.qp.verification import Slack, allowed, slack
 from vibench.results import consistency
 from vibench.results.consistency import Recorded, compare, disagreement_rows, solution_row, violations

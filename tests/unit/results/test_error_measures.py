@@ -11,8 +11,7 @@ from running import Main, refused, succeeded
 from samples import cell_row
 
 import vibench
-from vibench.errors import RequestError
-from vibench.interfaces.strategies import Kind
+from vibench import Kind, RequestError
 from vibench.results.break_even import break_even_rows
 from vibench.results.database import FILE, ResultsDatabase
 from vibench.results.ranking import errors_of, fastest, measures, with_errors, within

@@ -19,8 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import cells_of, row_of
 
-from vibench import open_run
-from vibench.errors import RequestError
+from vibench import RequestError, open_run
 from vibench.results import formats, ranking
 from vibench.results.paired_timing import PairedTiming
 from vibench.results.ranking import Criterion, Standings, cheapest, fastest, leaderboard

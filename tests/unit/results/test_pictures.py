@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from samples import SampleStore, carry_out
 
-from vibench.errors import RequestError
-from vibench.interfaces.outputs import Picture
+from vibench import Picture, RequestError
 from vibench.plugins.plugin import Plugin
 from vibench.results import pictures
 from vibench.results.database import ResultsDatabase

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.results.selection import matching, parts, short_keys, sorted_by
 
 FRAME = pd.DataFrame(columns=["cell", "solver", "N", "beta_span_min"])

@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import QUICK_ROUNDS, cell_row, query_rows
 
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.results import read, show, sqlite
 from vibench.results.break_even import break_even_rows
 from vibench.results.database import ResultsDatabase

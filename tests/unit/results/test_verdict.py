@@ -5,7 +5,7 @@ from typing import Any
 import pandas as pd
 from samples import cell_row
 
-from vibench.interfaces.strategies import Kind
+from vibench import Kind
 from vibench.results import formats
 from vibench.results.verdict import Verdict, verdicts
 

@@ -19,9 +19,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from vibench import InnerProduct
 from vibench.errors import NumericalError, RequestError, StorageError
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.supremizers import ContactCoordinates
 from vibench.stages import artefacts as module
 from vibench.stages import assembly  # noqa: F401  lists what operators consist of

@@ -8,9 +8,7 @@ import pytest
 from running import Register
 from samples import SampleStore, mixed_cell, store_of
 
-from vibench.interfaces.problem import MEMBERS
-from vibench.interfaces.strategies import Stop
-from vibench.interfaces.validation import checked_assembly
+from vibench import MEMBERS, Stop, checked_assembly
 from vibench.model.affine import Evaluation
 from vibench.model.galerkin import ReducedModel, project
 from vibench.model.hyperreduced import HyperReducedModel

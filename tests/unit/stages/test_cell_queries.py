@@ -10,9 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import SampleStore, carry_out, mixed_cell
 
-from vibench.interfaces.parameters import ParameterBox
-from vibench.interfaces.problem import VariationalInequality
-from vibench.interfaces.strategies import Stop
+from vibench import ParameterBox, Stop, VariationalInequality
 from vibench.offline.assemblies import Assemblies
 from vibench.plugins.plugin import Plugin
 from vibench.qp import verification

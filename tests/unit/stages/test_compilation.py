@@ -10,14 +10,12 @@ import pytest
 from samples import small_study
 
 import vibench
-from vibench.errors import UnsupportedError
-from vibench.interfaces.problem import MEMBERS, VariationalInequality
+from vibench import MEMBERS, Status, UnsupportedError, VariationalInequality
 from vibench.model.chebyshev import AffinePolynomial
 from vibench.offline import compiled, polynomials
 from vibench.offline.compiled import CompiledModel, compiler
 from vibench.offline.polynomials import InaccurateError
-from vibench.qp.status import Status
-from vibench.qp.verification import verify
+from vibench.qp import verify
 from vibench.report.figures.data import of_solvers
 from vibench.stages.query import ModelQuery
 from vibench.timing import timed

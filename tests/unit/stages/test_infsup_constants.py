@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from samples import SampleStore, mixed_cell, store_of
 
-from vibench.interfaces.strategies import Stop
+from vibench import Stop
 from vibench.plugins.plugin import Plugin
 from vibench.stability.infsup import InfSup, inf_sup_full, inf_sup_on
 from vibench.stages.base import value_of

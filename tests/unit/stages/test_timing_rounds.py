@@ -10,16 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import SampleStore, mixed_cell, store_of
 
-from vibench.errors import NumericalError
-from vibench.interfaces.problem import MEMBERS, VariationalInequality
-from vibench.interfaces.strategies import Stop
+from vibench import MEMBERS, NumericalError, QPSolution, Status, Stop, VariationalInequality, solve_qp
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.plugins import registry
 from vibench.plugins.plugin import Plugin
-from vibench.qp.solve import solve_qp
-from vibench.qp.status import Status
-from vibench.qp.verification import QPSolution
 from vibench.stages import marginal_solutions, timing_rounds
 from vibench.stages.base import Failed
 from vibench.stages.cell_queries import CellQueries

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from running import Register
 from samples import REMOVE, STUDY, changed, write_study
 
-from vibench.errors import RequestError
-from vibench.interfaces.strategies import Stop
+from vibench import RequestError, Stop
 from vibench.plugins import registry
 from vibench.plugins.plugin import Plugin
 from vibench.study import cells as module

@@ -12,9 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from samples import REMOVE, STUDY, changed, toml, write_study
 
-from vibench.errors import RequestError
+from vibench import RequestError, Study
 from vibench.study.matrix import expand, find_study, read_study
-from vibench.study.spec import Study
 
 JARGON = ("list[", "dict[", "literal[", "constrained", "instance of")
 """Words of the validation library that mean nothing to the author of a study file."""

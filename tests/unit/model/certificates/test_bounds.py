@@ -12,14 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import exact, space, spd
 
-from vibench import RAYS, create
-from vibench.errors import UnsupportedError
-from vibench.interfaces.affine import AffineSum
-from vibench.interfaces.affine_problem import AffineProblem
-from vibench.interfaces.parameters import ParameterBox
+from vibench import RAYS, AffineProblem, AffineSum, InnerProduct, ParameterBox, UnsupportedError, create
 from vibench.interfaces.problem import Contact, Problem, Sampler, VariationalInequality
 from vibench.interfaces.strategies import Enrichment, Kind
-from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import affine_decomposition
 from vibench.model.bound_terms import BoundNote, CorrectionMode
 from vibench.model.certificates import contact_correction

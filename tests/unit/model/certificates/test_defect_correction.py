@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import exact, spd
 
-from vibench.interfaces.problem import Contact, VariationalInequality
+from vibench import Contact, VariationalInequality
 from vibench.linalg import EPS
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.certificates.contact_correction import ContactCompliance

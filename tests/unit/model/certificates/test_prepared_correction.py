@@ -8,7 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from numerics import exact, spd
 
-from vibench.interfaces.problem import VariationalInequality
+from vibench import VariationalInequality
 from vibench.model.certificates.contact_correction import ContactCompliance
 from vibench.model.certificates.prepared_correction import constant_unknowns, prepare_corrections
 

@@ -9,9 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import space, spd
 
-from vibench import InnerProduct
-from vibench.interfaces.parameters import ParameterBox
-from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench import InnerProduct, ParameterBox, Problem, VariationalInequality
 from vibench.model.certificates.spectral import AnchorGrid, TermRanges, leading_terms, rotated, spectral_bounds
 from vibench.stability.coercivity import operator_norm
 
