@@ -1,7 +1,5 @@
 """Formulations beside plain versions of them that are written from their papers, on a small Hertz contact."""
 
-from __future__ import annotations
-
 import numpy as np
 import plain_formulations as plain
 import pytest

@@ -1,7 +1,5 @@
 """Packs with one mistake that an exporting user may make: each has a line of its own, and none runs."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import os

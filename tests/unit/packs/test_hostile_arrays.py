@@ -1,7 +1,5 @@
 """Arrays that no code wrote in good faith: each ends in one line, and no interpreter ends because of it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable

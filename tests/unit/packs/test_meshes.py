@@ -1,7 +1,5 @@
 """Meshes of others: formats of one file, read in a process whose memory and seconds are limited."""
 
-from __future__ import annotations
-
 import base64
 import os
 import zlib

@@ -1,7 +1,5 @@
 """Quantities of interest of model packs: linear ones are written and read; mistakes are named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

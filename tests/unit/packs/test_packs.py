@@ -1,7 +1,5 @@
 """Model packs: what is read is what was written, in every format, and results of an edited one are not used again."""
 
-from __future__ import annotations
-
 import codecs
 import gzip
 import json

@@ -1,7 +1,5 @@
 """Two runs side by side: what got worse is found, and nothing else is."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

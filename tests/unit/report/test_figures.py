@@ -1,7 +1,5 @@
 """Figures: every one of a real run is drawn and shows the numbers of its results file."""
 
-from __future__ import annotations
-
 import html
 import json
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The report: whole, self-contained, and nothing in it is markup that somebody else wrote."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

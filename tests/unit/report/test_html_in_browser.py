@@ -1,7 +1,5 @@
 """The report in a real browser: what it shows at desktop and phone width, in light and dark, and what it does."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io

@@ -1,7 +1,5 @@
 """The script of exported test sets, which is written apart from the verification, defines the same residuals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Replay and export of the reduced programs of a run, through the command line and from Python."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The site of some runs: whole, alive in a real browser, reproducible, and careful with files of others."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

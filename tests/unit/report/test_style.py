@@ -1,7 +1,5 @@
 """The style of figures: labels are text of others and are drawn as they are."""
 
-from __future__ import annotations
-
 import io
 from itertools import combinations
 from xml.etree import ElementTree
