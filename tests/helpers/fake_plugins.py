@@ -6,7 +6,6 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -80,32 +79,6 @@ class Broken(Wire):
         raise OSError("no wire in stock")
 
 
-class Hungry(Wire):
-    def __init__(self) -> None:
-        super().__init__()
-        self.meal = np.ones(2**36)
-
-
-Infeasible = _changed(
-    "Infeasible", lambda vi: replace(vi, B=sp.csr_array(sp.vstack([vi.B[:6], -vi.B[:6]])), g=np.full(12, -1.0))
-)
-
-
-class Chatty(Wire):
-    """Prints, writes past Python, forks, and is right all the same."""
-
-    forked = False
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        print("assembling", mu)
-        print("careful", file=sys.stderr)
-        os.write(1, b"written past Python\n")
-        if not self.forked:
-            self.forked = True
-            os.fork()  # two go on from here
-        return super().assemble(mu)
-
-
 class BadCone(DualStrategy):
     def __init__(self, how: Literal["negative"]) -> None:
         self.how = how
@@ -154,12 +127,8 @@ def _answering(answer: Callable[[VariationalInequality], Any]) -> Callable[[Vari
 raises = _answering(lambda _: throw(RuntimeError("the solver\ngave in")))
 leaves = _answering(lambda _: sys.exit(3))
 dies = _answering(lambda _: os._exit(7))
-nothing = _answering(lambda _: None)
 gives_up = _answering(lambda _: QPSolution(None, None, "gave up"))
-not_a_number = _answering(lambda vi: QPSolution(np.full(len(vi.f), np.nan), np.zeros(len(vi.g)), "solved"))
 wrong = _answering(lambda vi: QPSolution(np.zeros(len(vi.f)), np.zeros(len(vi.g)), "solved"))
-wrong_length = _answering(lambda vi: QPSolution(np.zeros(len(vi.f) + 1), np.zeros(len(vi.g)), "solved"))
-hungry = _answering(lambda _: QPSolution(np.ones(2**36), np.ones(3), "solved"))
 
 
 def numpy_count(program: VariationalInequality, accuracy: float) -> QPSolution:

@@ -116,18 +116,14 @@ def query_rows(cell: str = "c1", count: int = 2, **columns: Any) -> list[dict[st
 
 
 FAKES: Mapping[str, Mapping[str, str]] = {
-    "vibench.problems": {
-        "wire": "Wire", "wire-raises": "Raises", "wire-broken": "Broken", "wire-hungry": "Hungry",
-        "wire-sleeps": "Sleeps", "wire-exits": "Exits", "wire-segfaults": "Segfaults", "wire-infeasible": "Infeasible",
-        "wire-chatty": "Chatty",
-    },
+    "vibench.problems": {"wire": "Wire", "wire-raises": "Raises", "wire-broken": "Broken", "wire-sleeps": "Sleeps"},
     "vibench.dual_strategies": {
         "cone-needs": "NeedyCone", "cone-raises": "RaisingCone", "cone-waits": "WaitingCone",
     },
     "vibench.primal_strategies": {"enrichment-counts": "CountingEnrichment"},
-    "vibench.qp_solvers": {"nan": "not_a_number", "counts": "numpy_count"} | {name.replace("_", "-"): name for name in (
-        "careful", "raises", "nothing", "gives_up", "wrong", "wrong_length", "dies", "leaves", "hangs", "segfaults",
-        "dies_sometimes", "dies_once", "hungry", "chatty",
+    "vibench.qp_solvers": {"counts": "numpy_count"} | {name.replace("_", "-"): name for name in (
+        "careful", "raises", "gives_up", "wrong", "dies", "leaves", "hangs", "segfaults", "dies_sometimes", "dies_once",
+        "chatty",
     )},
 }  # fmt: skip
 """What the third-party package registers: group → name → member of `fake_plugins`."""

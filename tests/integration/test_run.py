@@ -1,11 +1,7 @@
 """Running a matrix through the command line."""
 
-import importlib.util
-import os
 import re
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -176,36 +172,6 @@ def test_plugins_whose_requirements_are_missing_are_unavailable(vibench: Vibench
     first, results = done.stdout.splitlines()
     assert (first, results.split()[0]) == ("2 cells, 0 to run, 0 stages", "results:")
     assert {row["reason"] for row in rows(folder / "runs" / "wire")} == {reason}
-
-
-@pytest.mark.long
-def test_edits_beside_numbers_run_none(vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures, help texts, the report and the tables may change: the run is complete, and its models open."""
-    package, edited_core = Path(importlib.util.find_spec("vibench").submodule_search_locations[0]), tmp_path / "core"
-    # First on the path the copy takes the place of what is installed; its bytecode would take seconds to make.
-    shutil.copytree(package, edited_core / "vibench")
-    monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
-    rope = {"name": "radial-obstacle", "options": {"resolution": 200}}
-    study = write_study(tmp_path, wire_study(problem=[rope]))
-
-    def edited(*commands: tuple[str, ...]) -> str:
-        """What commands print, one after the other, in one new interpreter."""
-        program = f"from vibench.cli.main import app\nfor c in {commands}: app(args=[*c], standalone_mode=False)"
-        environment = os.environ | {"PYTHONPATH": str(edited_core)}
-        done = subprocess.run(
-            [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
-        assert (done.returncode, done.stderr) == (0, "")
-        return done.stdout
-
-    run = ("run", study, "--jobs", "1", "--no-figures")
-    assert "1 cells, 1 to run" in vibench(tmp_path, *run).stdout  # with what is installed, where nothing is edited
-    for module in ("report/html.py", "report/figures/style.py", "cli/main.py", "results/read.py", "testing/sample.py"):
-        with (edited_core / "vibench" / module).open("a", encoding="utf-8") as source:
-            source.write("\n# edited\n")
-    printed = edited(run, ("export", "wire", "programs"))
-    assert "1 cells, 0 to run, 0 stages" in printed
-    assert "3 programs" in printed  # of the model as it was
 
 
 def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) -> None:

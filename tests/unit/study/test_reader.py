@@ -1,6 +1,5 @@
 """Study files: what is refused, with which words, and what the options of the command line replace."""
 
-import contextlib
 import datetime
 import tomllib
 from collections.abc import Mapping
@@ -295,10 +294,14 @@ def test_no_mutation_of_a_study_raises_anything_but_a_refusal(data: st.DataObjec
         added = data.draw(st.booleans()) and isinstance(where[-1], str)
         path = (*where[:-1], data.draw(KEYS)) if added else where
         content = changed(content, *path, to=data.draw(VALUES if added else SCALARS | VALUES))
-    with contextlib.suppress(RequestError):
+    line = ""
+    try:
         study = read_study(write_study(tmp_path, content))
         assert isinstance(study, Study)
         assert expand(study)
+    except RequestError as error:
+        line = str(error)
+    assert line.isprintable()
 
 
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
