@@ -16,7 +16,7 @@ settings.load_profile("same")
 
 
 LONGEST = (
-    "test_borders", "test_misbehaviour", "report/test_figures", "test_executors", "test_docs", "test_other_problems",
+    "test_borders", "test_misbehaviour", "report/test_figures", "test_executors", "test_docs",
     "test_example_rope", "test_hertz3d", "test_conformance", "test_machines", "test_html_in_browser",
     "test_results_folder", "test_run", "test_supervisor", "test_c_source", "test_scaffold",
     "test_interruptions", "test_error_bounds", "test_html", "test_site", "test_keys",

@@ -1,5 +1,3 @@
-"""Runs that are killed at random moments, and full disks: nothing is lost, and a later run completes the rest."""
-
 import contextlib
 import os
 import random

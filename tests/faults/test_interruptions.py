@@ -1,5 +1,3 @@
-"""Runs that are stopped in the middle, and go on."""
-
 import contextlib
 import os
 import shutil

@@ -1,5 +1,3 @@
-"""Worker processes that hang, die or are told to stop: what is kept, what is said, and how soon."""
-
 import contextlib
 import itertools
 import os

@@ -12,7 +12,7 @@ ANSWERS = 6
 
 @pytest.mark.long
 @pytest.mark.parametrize(("last_call", "lost"), [(ANSWERS + 1, 1), (ANSWERS + 1 + ROUNDS, 1), (ANSWERS, 0)])
-def test_a_solver_that_dies_in_a_round_costs_that_round(
+def test_a_death_costs_its_round(
     last_call: int, lost: int, vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where it dies at an answer, in the last case, it costs that query and no round of the others."""

@@ -55,7 +55,7 @@ class Lost(vibench.AdaptiveSampling):
         raise KeyError("lost")
 
 
-def test_failed_solutions_are_offline_time_and_samplings_have_own_faults(
+def test_failed_solutions_are_offline_time_and_samplings_have_faults(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cell, clock, assemble = expand(study({"name": "own", "on_failure": "skip"}))[0], [0.0], Tangled.assemble

@@ -1,5 +1,3 @@
-"""Formulations in studies: the mixed one as a plugin gives its numbers, and misbehaviour costs its own rows."""
-
 from pathlib import Path
 from typing import Any
 

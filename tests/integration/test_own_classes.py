@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from forking import run_script
-from running import PATIENCE, Main, refused
+from running import PATIENCE
 
 import vibench
 
@@ -119,17 +119,3 @@ def test_the_same_classes_are_not_run_again_and_edited_ones_are(folder: Path) ->
     for changed in (after["code"] != before["code"], after["error_u_mean"] != before["error_u_mean"]):
         assert changed[edited].all()
     assert (after["code"] == before["code"])[~edited].all()
-
-
-@pytest.mark.long
-def test_other_processes_read_the_run_and_refuse_its_models_in_a_line(folder: Path, main: Main) -> None:
-    out = str(folder / "out")
-    code, printed, _ = main("show", out)
-    assert code == 0
-    assert "short" in printed
-    assert main("compare", out, out)[0] == 0
-    cell = vibench.open_run(out).cells.set_index("problem")["cell"]["Wire"]
-    for command in (("replay", out, cell), ("run", f"{out}/results.sqlite", "--cell", cell)):
-        refused(main(*command), "problem 'Wire' is a class or an object that", "another process")
-    with pytest.raises(vibench.RequestError, match="problem 'Wire' is a class or an object"):
-        vibench.open_run(out).model(cell)

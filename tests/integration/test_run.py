@@ -1,8 +1,5 @@
-"""Running a matrix through the command line."""
-
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -13,7 +10,6 @@ from samples import wire_study, write_study
 import vibench.execution.run  # noqa: F401  lists the classes of all stages
 from vibench.results.schema import TABLES
 from vibench.results.sqlite import FILE
-from vibench.stages.artefacts import Store, encoded
 from vibench.study.parameter_sets import CHUNKS
 
 SOLVERS = ["piqp", "careful", "gives-up"]
@@ -184,38 +180,6 @@ def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) 
         done = vibench(tmp_path, "run", "study.toml", "--jobs", jobs, "--out", jobs, "--fresh")
         assert done.returncode == 0, done.stderr
     assert_same_numbers(tmp_path / "1", tmp_path / "2")
-
-
-@pytest.mark.long
-def test_artefacts_are_shared_on_one_machine(vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
-    # high-fidelity solutions of both sets, and their constants at one; pictures; POD, cone, enrichment; assembly, exact
-    # solutions; constraints twice; five inf-sup constants
-    made = 3 * CHUNKS + 13
-    one = wire_study(solvers=["piqp", "careful"])
-    two = one | {"name": "other", "accuracy": 1e-6}
-    write_study(tmp_path, one, "one.toml")
-    write_study(tmp_path, two, "two.toml")
-
-    def stages(*options: str) -> int:
-        done = vibench(tmp_path, "run", *options, "--jobs", "1")
-        assert (done.returncode, done.stderr) == (0, "")
-        return int(re.search(r"to run, (\d+) stages", done.stdout)[1])
-
-    assert stages("one.toml") == made + 2
-    assert stages("two.toml") == 2  # only the queries of its two cells
-    assert stages("one.toml", "--out", "again") == 2
-    assert stages("one.toml", "--out", "anew", "--fresh") == made + 2
-    assert_same_numbers(tmp_path / "again", tmp_path / "anew")
-    # wall seconds are those of the stages alone: how often short ones are repeated depends on what they take
-    again, anew = (rows(tmp_path / folder)[0]["offline_wall_s"] for folder in ("again", "anew"))
-    assert again == rows(tmp_path / "runs" / "wire")[0]["offline_wall_s"] != anew  # measured only where made anew
-    store = Store(tmp_path / "cache" / "artefacts")
-    for path in (tmp_path / "cache" / "artefacts").glob("*.artefact"):
-        key = path.name.removesuffix(".artefact")
-        path.write_bytes(encoded(key, replace(store.get(key), machine="elsewhere")))
-    assert stages("one.toml", "--out", "here") == made + 2
-    assert rows(tmp_path / "here")[0]["machine"] == rows(tmp_path / "again")[0]["machine"]
 
 
 def test_clean_shows_and_frees_artefacts(vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,3 @@
-"""Lock files: one holder, or several that share, and a refusal that names it; what killed processes leave."""
-
 import os
 from pathlib import Path
 

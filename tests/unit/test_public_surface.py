@@ -1,5 +1,3 @@
-"""What authors of plugins and users of the library import: from `vibench` or a named submodule of it, and lazily."""
-
 import inspect
 import re
 import subprocess

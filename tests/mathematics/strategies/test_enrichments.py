@@ -186,7 +186,7 @@ ON_BETA = pytest.mark.parametrize("strategy", [InfSupGreedy(), OfflinePGA(stop="
 @ON_BETA
 @pytest.mark.parametrize("rho", [0.2, 0.9])
 @BOTH
-def test_the_share_is_kept_at_every_training_parameter_and_not_with_a_vector_less(
+def test_the_share_is_kept_at_every_parameter_by_no_fewer(
     request, setting: str, strategy: NestedStrategy, rho: float
 ) -> None:
     data: Offline = request.getfixturevalue(setting)

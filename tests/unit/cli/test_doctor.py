@@ -1,5 +1,3 @@
-"""What the doctor says, and when something counts as broken."""
-
 import importlib.metadata
 from pathlib import Path
 from types import SimpleNamespace

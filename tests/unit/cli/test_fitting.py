@@ -1,5 +1,3 @@
-"""Tables fit the terminal, and what is left out is named; text from others acts on nothing, and lines stay lines."""
-
 import contextlib
 import io
 import re

@@ -1,5 +1,3 @@
-"""The command line: what is wrong with a request is one line and exit code 2, and nothing is started."""
-
 import csv
 import importlib.metadata
 import io

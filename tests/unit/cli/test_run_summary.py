@@ -1,5 +1,3 @@
-"""The end of a run: reasons are grouped, cells are named wholly, and what to do next are commands."""
-
 import shlex
 from pathlib import Path
 from typing import Any

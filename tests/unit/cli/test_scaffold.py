@@ -1,5 +1,3 @@
-"""`vibench new`: packages that install, pass their own tests and give rows as they are; bad names leave nothing."""
-
 import subprocess
 import sys
 import tomllib

@@ -1,5 +1,3 @@
-"""Where stages run: the same numbers on a dask cluster, and what becomes of workers that die or are of no use."""
-
 import contextlib
 import os
 import socket
@@ -167,9 +165,7 @@ def test_a_cluster_that_cannot_start_is_refused_in_a_line(tmp_path: Path) -> Non
         Dask(None, 1, tmp_path)
 
 
-def test_other_code_and_workers_without_artefacts_are_refused(
-    cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_code_or_store_is_refused(cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(executors, "code_here", lambda: "mine")
         with pytest.raises(RequestError, match=r"the dask worker tcp://.* has other code: .* instead of mine"):
@@ -179,9 +175,7 @@ def test_other_code_and_workers_without_artefacts_are_refused(
         Dask(cluster.scheduler_address, 1, tmp_path)
 
 
-def test_wrong_requests_for_dask_are_refused_in_a_line(
-    main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wrong_requests_for_dask_are_one_line(main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, there = write_study(tmp_path, wire_study(problem=["obstacle"])), "tcp://127.0.0.1:9"
     for options, expected in (
         (("--executor", "dask", "--scheduler", there), f"no dask scheduler answers at '{there}'"),

@@ -1,5 +1,3 @@
-"""The order of stages: each once, after what it needs, and none that leads to nothing."""
-
 from __future__ import annotations
 
 from collections.abc import Callable

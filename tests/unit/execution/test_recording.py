@@ -1,5 +1,3 @@
-"""The folder of a run: one run at a time, nothing of others, which cells run again, and columns that name rows."""
-
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

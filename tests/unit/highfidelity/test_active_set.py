@@ -174,7 +174,7 @@ class Crooked(Varying):
 
 
 @pytest.mark.parametrize("constant", [frozenset(), frozenset({"A"})], ids=["varying", "constant"])
-def test_a_stiffness_that_is_not_symmetric_is_refused_and_where(
+def test_an_unsymmetric_stiffness_is_refused_and_where(
     constant: frozenset[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, mu = Crooked(), np.array([0.5])

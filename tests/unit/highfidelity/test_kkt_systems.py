@@ -1,5 +1,3 @@
-"""Sparse systems of active sets against the dense ones, whatever was factorised before."""
-
 import contextlib
 from unittest import mock
 

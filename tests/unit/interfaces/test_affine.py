@@ -1,5 +1,3 @@
-"""Affine sums and problems that consist of them."""
-
 import math
 import pickle
 from typing import Any

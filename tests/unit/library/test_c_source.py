@@ -1,5 +1,3 @@
-"""Exported C sources, compiled: they answer as the models do, whatever the constraints are like."""
-
 import ctypes
 import shutil
 import subprocess

@@ -1,5 +1,3 @@
-"""Exported models answer as the models do, without vibench; what cannot be exported is refused with a line."""
-
 import json
 import re
 import subprocess

@@ -1,5 +1,3 @@
-"""FMUs of models: a client of FMI 2.0 finds nothing wrong with them, and the answers of the models in them."""
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

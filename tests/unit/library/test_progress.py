@@ -1,5 +1,3 @@
-"""Progress: the time left, durations in words, and what is printed where there is no terminal."""
-
 import io
 from collections.abc import Sequence
 from itertools import pairwise

@@ -55,7 +55,7 @@ def partly_eliminated(seed: int, count: int, bodies: bool) -> tuple[np.ndarray, 
 
 
 @given(st.integers(0, 10_000), st.integers(0, 9), st.booleans(), st.integers(0, 3))
-def test_partial_factors_give_the_matrix_its_schur_complement_and_all_unknowns(
+def test_partial_factors_give_matrix_schur_complement_and_unknowns(
     seed: int, count: int, bodies: bool, columns: int
 ) -> None:
     X, last, factor = partly_eliminated(seed, count, bodies)

@@ -1,5 +1,3 @@
-"""Every implementation of factorisations against dense matrices; and what it has to refuse."""
-
 import numpy as np
 import pytest
 import scipy.sparse as sp

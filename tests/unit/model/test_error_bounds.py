@@ -173,9 +173,7 @@ def test_a_multiplier_that_is_small_beside_the_error_of_u_is_bounded(seed: int, 
 
 
 @given(approximations())
-def test_the_multiplier_of_a_correction_is_the_high_fidelity_one_where_there_is_no_residual(
-    given: Approximation,
-) -> None:
+def test_without_a_residual_the_multiplier_of_a_correction_is_the_high_fidelity_one(given: Approximation) -> None:
     vi, u, lam, _, lam_N = given
     A = vi.A.toarray()
     without = np.linalg.solve(A, vi.f - vi.B.T @ lam_N)

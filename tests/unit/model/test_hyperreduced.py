@@ -1,5 +1,3 @@
-"""Queries without arrays of mesh size give the programs of queries in full."""
-
 import pickle
 import sys
 import tracemalloc
@@ -163,7 +161,7 @@ SIZES = [("constant", 3, 2), ("several", 3, 2), ("constant", 3, 0), ("constant",
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("constraint", WAYS)
 @pytest.mark.parametrize(("stiffness", "modes", "generators"), SIZES)
-def test_programs_are_those_of_the_full_assembly(
+def test_programs_are_fully_assembled_ones(
     constraint: str, stiffness: str, modes: int, generators: int, kind: str
 ) -> None:
     """Also without modes or without generators."""
@@ -215,7 +213,7 @@ def test_members_on_the_contact_and_interpolated_ones_go_together(entrywise: str
 
 @given(st.integers(14, 40), st.integers(3, 9), st.integers(1, 5), st.integers(1, 5), st.sampled_from(WAYS))
 @settings(max_examples=15)
-def test_programs_of_spaces_that_depend_on_mu_are_right_in_all_dimensions(
+def test_spaces_that_depend_on_mu_have_the_programs(
     n: int, m: int, modes: int, generators: int, constraint: str
 ) -> None:
     """Where supremizers of several terms are as many as unknowns, too."""
@@ -257,9 +255,7 @@ def test_operators_travel() -> None:
         ("several", "contact", "none", 4, False),
     ],
 )
-def test_a_factor_comes_with_a_constant_stiffness_on_a_fixed_space(
-    stiffness: str, constraint: str, kind: str, modes: int, dual: bool
-) -> None:
+def test_constant_stiffness_gives_a_factor(stiffness: str, constraint: str, kind: str, modes: int, dual: bool) -> None:
     query = online(reduced_model(rope(constraint, stiffness), kind, modes, 3)).assemble(NEW[1])
     assert (query.factor is not None) == dual
     primal = solve_qp(query.program, "piqp", 1e-10)

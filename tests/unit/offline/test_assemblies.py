@@ -1,5 +1,3 @@
-"""What a problem assembles, kept while there is room for it."""
-
 from dataclasses import replace
 
 import numpy as np

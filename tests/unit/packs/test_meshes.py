@@ -37,7 +37,6 @@ MORE = (
 @pytest.mark.parametrize("ending", [".vtu", *MORE])
 def test_formats_of_one_file_are_read(ending: str, tmp_path: Path) -> None:
     mesh = read_model_pack(with_mesh(tmp_path / "pack", f"mesh{ending}")).mesh
-    assert mesh is not None
     corners = mesh.points[:, mesh.triangles]  # their numbers are those of the file, but in .stl
     assert np.allclose(corners, np.array([[[0, 1], [1, 2], [11, 11]], [[0, 0], [0, 0], [11, 11]]]) / 11, atol=1e-7)
 

@@ -1,5 +1,3 @@
-"""Quantities of interest of model packs: linear ones are written and read; mistakes are named."""
-
 from pathlib import Path
 from typing import Any
 

@@ -260,9 +260,7 @@ def test_import_solves_once_and_reads_a_byte_order_mark(tmp_path: Path, main: Ma
     assert read_study(str(study)).name == "marked"
 
 
-def test_import_refuses_a_pack_without_a_solution_and_says_which_rows_constrain_nothing(
-    tmp_path: Path, main: Main
-) -> None:
+def test_import_refuses_a_pack_without_a_solution_and_names_empty_rows(tmp_path: Path, main: Main) -> None:
     cable = Cable()
     kept = cable.B
     cable.B = sp.csr_array(sp.vstack([kept[:6], -kept[:6]]))
@@ -310,9 +308,7 @@ def test_a_pack_is_written_whole_or_not_at_all(tmp_path: Path, main: Main, monke
     assert [path.name for path in Path().iterdir()] == ["new"]
 
 
-def test_a_problem_of_constants_and_declared_sums_is_assembled_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_constants_and_declared_sums_are_assembled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     problem, assembled = create("problem", "pack", {"path": str(write_cable(tmp_path / "pack"))}), []
     monkeypatch.setattr(writer, "checked_assembly", lambda *given: assembled.append(1) or checked_assembly(*given))
     writer.write_pack(problem, tmp_path / "new", name="cable", source="", validation=2, seed=0)

@@ -228,9 +228,7 @@ def test_labels_and_options_tell_objects_and_classes_apart(names: dict[str, Any]
     assert [cell.problem.create().V.dim for cell in cells] == [12, 9, 6, 8]
 
 
-def test_the_definition_of_a_cell_holds_no_object_and_a_pickled_plugin_brings_it(
-    names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_definition_holds_no_object_and_a_pickle_does(names: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """It is found again by what made it, and refused in a line where that is not: another process, edited code."""
     (cell,) = expand(study(problem=[names["Mine"](9)]))
     content = json.loads(cell.definition)

@@ -1,5 +1,3 @@
-"""Plugins: found through entry points, refused with a reason, created from checked options."""
-
 import datetime
 import importlib.metadata
 import sys
@@ -157,7 +155,7 @@ def test_a_name_of_two_packages_or_of_a_solver_of_qpsolvers_is_refused(register:
     assert find(PluginKind.SOLVER, "osqp").conflict == ""
 
 
-def test_names_are_sorted_and_each_distribution_is_one(
+def test_names_are_sorted_each_distribution_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, register: Register
 ) -> None:
     for folder in ("one", "other"):
@@ -185,9 +183,7 @@ UNLOADABLE = [
 ]
 
 
-def test_the_entry_point_is_named_if_broken(
-    register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_broken_entry_point_is_named(register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     failing = {"raises": "raise OSError('no licence')", "divides": "1 / 0", "syntax": "def f(:"}
     for name, code in failing.items():

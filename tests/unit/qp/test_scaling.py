@@ -1,5 +1,3 @@
-"""Units of quadratic programs: scaling loses nothing, and without load a program is solved in any units of its data."""
-
 from dataclasses import replace
 from itertools import product
 

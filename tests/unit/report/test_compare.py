@@ -1,5 +1,3 @@
-"""Two runs side by side: what got worse is found, and nothing else is."""
-
 import json
 import re
 import shutil

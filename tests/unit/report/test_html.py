@@ -1,5 +1,3 @@
-"""The report: whole, self-contained, and nothing in it is markup that somebody else wrote."""
-
 import json
 import re
 from pathlib import Path

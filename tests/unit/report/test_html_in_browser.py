@@ -346,9 +346,7 @@ return { cell: data.cell[0], lines: lines(views[0]).length, curves, hash: locati
 """
 
 
-def test_the_verdict_comes_first_and_plots_before_tables_say_which_model_for_how_many_queries(
-    browser: Chrome, made: Path
-) -> None:
+def test_the_verdict_comes_first_and_plots_say_which_model_for_how_many_queries(browser: Chrome, made: Path) -> None:
     """Points with the high-fidelity model as a line, total costs with bands; a selected point leads to its row."""
     look(browser, made)
     show_plot(browser, "hertz-overview")

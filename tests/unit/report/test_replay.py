@@ -1,5 +1,3 @@
-"""Replay and export of the reduced programs of a run, through the command line and from Python."""
-
 import subprocess
 import sys
 from pathlib import Path

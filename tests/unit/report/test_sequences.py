@@ -1,5 +1,3 @@
-"""Ordered validation sets from the study to a test set of qpbenchmark."""
-
 from __future__ import annotations
 
 import importlib

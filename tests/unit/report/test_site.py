@@ -1,5 +1,3 @@
-"""The site of some runs: whole, alive in a real browser, reproducible, and careful with files of others."""
-
 import json
 import re
 import shutil

@@ -1,5 +1,3 @@
-"""The style of figures: labels are text of others and are drawn as they are."""
-
 import io
 from itertools import combinations
 from xml.etree import ElementTree
@@ -91,9 +89,7 @@ NAMES = st.lists(st.text(max_size=12), min_size=1, max_size=10, unique=True)
 
 
 @given(NAMES, NAMES)
-def test_a_strategy_looks_the_same_in_every_figure_where_no_other_has_its_colour(
-    one: list[str], other: list[str]
-) -> None:
+def test_a_strategy_looks_the_same_where_no_other_has_its_colour(one: list[str], other: list[str]) -> None:
     """Whatever else a run compares, in whatever order, and at whatever tolerances."""
     alone, among = Looks([Series(one[0])]), Looks([Series(name, 0.5) for name in [*reversed(other), one[0]]])
     first, second = alone[Series(one[0])], among[Series(one[0], 0.5)]

@@ -1,5 +1,3 @@
-"""Benefit thresholds: the paper's, their four meanings, and which cells are compared."""
-
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""Inequalities that recorded constants and bounds satisfy, and solvers that agree or are flagged."""
-
 from collections.abc import Iterator
 
 import numpy as np

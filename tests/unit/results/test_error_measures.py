@@ -1,5 +1,3 @@
-"""Models compared by the error of a quantity of interest: break-even, the fastest cells and the figure of both."""
-
 import re
 from pathlib import Path
 from typing import Any

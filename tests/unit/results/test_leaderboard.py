@@ -39,7 +39,6 @@ def test_the_fastest_query_wins_its_band_or_the_high_fidelity_model_which_paces_
     (found,) = leaderboard(cells_of(row_of("a", 0.05, 0.4, hf_s=0.5), row_of("b", 1e-3, 0.6, hf_s=0.5)))
     assert won(found, Criterion.QUERY) == [(0.1, "a"), (1e-3, "")]
     winner = found.bands[-1].winner(Criterion.QUERY)
-    assert winner is not None
     assert (winner.cell["primal"], winner.value) == ("high-fidelity", pytest.approx(0.5))
     (found,) = leaderboard(cells_of(row_of("a", 0.05, 0.3, hf_s=1.0), row_of("b", 0.05, 0.2, hf_s=0.5)))
     assert won(found, Criterion.QUERY) == [(0.1, "a")]
@@ -89,7 +88,6 @@ def test_differences_within_their_interval_or_the_work_of_solvers_are_ties() -> 
     rows = [row_of(name, error, 0.1, **parts) for name, error in (("a", 1.001e-2), ("b", 1e-2), ("c", 1.1e-2))]
     (found,) = leaderboard(cells_of(*rows))
     winner = found.bands[0].winner(Criterion.ERROR)
-    assert winner is not None
     assert (winner.cell["cell"], winner.ties) == ("b", ("a",))
 
 
@@ -109,7 +107,6 @@ def test_nobody_in_a_band_is_better_than_its_winner(found: list[tuple[float, flo
         assert len(mine) == band.cells
         for criterion, place in ((Criterion.ERROR, 0), (Criterion.QUERY, 1), (Criterion.OFFLINE, 2)):
             winner = band.winner(criterion)
-            assert winner is not None
             assert winner.value == pytest.approx(min(one[place] for one in mine))
             assert found[int(winner.cell["cell"])][place] == winner.value
         assert band.error <= ranking.LARGEST_BAND * (1 + 1e-12)
@@ -180,10 +177,8 @@ def test_the_winners_of_the_leaderboard_are_those_of_the_raw_rows(raw: Raw, fold
             assert len(within) == band.cells
             best = max(within, key=lambda cell: raw.gain(cell["cell"]))
             winner = band.winner(Criterion.QUERY)
-            assert winner is not None
             assert winner.cell["cell"] == (best["cell"] if raw.gain(best["cell"]) >= 1.0 else "")
             offline = band.winner(Criterion.OFFLINE)
-            assert offline is not None
             assert offline.value == min(cell["offline_s"] for cell in within)
             # the same model with another solver has the same offline seconds: no solver wins them
             models = {cell["cell"] for cell in within if cell["model"] == offline.cell["model"]}

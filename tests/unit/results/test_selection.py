@@ -1,5 +1,3 @@
-"""What `--where`, `--sort` and short keys select, and what a condition may not do."""
-
 import contextlib
 import hashlib
 import sqlite3

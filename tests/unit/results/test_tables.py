@@ -1,5 +1,3 @@
-"""Tables: found, read, put in order, written, and printed for reading, with the names of parameters."""
-
 import csv
 import dataclasses
 import io

@@ -1,5 +1,3 @@
-"""Queries that start from the solution before them on a path through the parameters."""
-
 from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Wrong models are named by the high-fidelity sweep of a run, and by all that reads what another process computed."""
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal

@@ -1,5 +1,3 @@
-"""Rounds of timing: what is timed in which order, and what becomes of it."""
-
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
@@ -182,7 +180,6 @@ def test_solutions_come_amid_queries_until_enough_or_serve_all_cells(taken: floa
         list(beside.alternated(queries, done, 0, 0))
     assert [one.seconds is None for one in done] == [False, True, False]
     mean = beside.seconds(done, (1, 2, 3))
-    assert mean is not None
     assert mean.cpu == pytest.approx(0.02 * (11.0 / 3.0) / 4.0)  # the right ones are at parameters 1 and 3
     assert beside.seconds([done[1]], (1, 2, 3)) is None
 

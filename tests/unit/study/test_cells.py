@@ -1,5 +1,3 @@
-"""The matrix of a study: how many cells, which ones, and what identifies them."""
-
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path

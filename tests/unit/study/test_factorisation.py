@@ -1,5 +1,3 @@
-"""Who factorises is chosen by a study, part of the identity of its problem, and changes no number."""
-
 from unittest import mock
 
 import numpy as np

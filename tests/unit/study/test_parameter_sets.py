@@ -1,5 +1,3 @@
-"""Training and validation sets in study files: what a cell gets, and one line for what cannot be."""
-
 import json
 import os
 from collections.abc import Mapping

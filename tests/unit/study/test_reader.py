@@ -1,5 +1,3 @@
-"""Study files: what is refused, with which words, and what the options of the command line replace."""
-
 import datetime
 import tomllib
 from collections.abc import Mapping

@@ -1,5 +1,3 @@
-"""A study of one cell has that cell: a row can be made again from what is recorded of it."""
-
 import json
 from collections import Counter
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Conformance checks of the plugins that come with vibench, their rules, the search for jumps, and the command."""
-
 import importlib.metadata
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,5 +1,3 @@
-"""Every fault of a plugin is found by the check made for it; plugins that are right pass."""
-
 from collections.abc import Mapping
 from functools import partial
 from importlib import import_module

@@ -1,5 +1,3 @@
-"""Sampling strategies that are wrong, each in one way: the check made for it finds it, and no other does."""
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import repeat

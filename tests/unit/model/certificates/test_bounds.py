@@ -209,7 +209,7 @@ def test_no_error_is_above_its_bound(kind: tuple[str, bool, str], seed: int, siz
 
 
 @pytest.mark.parametrize("kind", TIED)
-def test_what_equalities_may_miss_enters_where_the_derivation_says(
+def test_what_equalities_miss_is_where_the_proof_says(
     kind: tuple[str, bool, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A larger η, with all else as it is, shows in the bound of λ_N and in those of the corrected pair."""
@@ -274,7 +274,7 @@ def test_the_residual_of_a_corrected_pair_is_that_of_the_inner_product_in_place_
 
 
 @pytest.mark.parametrize(("stiffness", "differs"), [("constant", False), ("affine", True), ("interpolated", True)])
-def test_errors_are_told_apart_where_the_stiffness_varies_alone(
+def test_errors_differ_where_the_stiffness_varies(
     stiffness: str, differs: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Elsewhere bounds are those of the sum of both, to the last bit."""
@@ -583,9 +583,7 @@ def test_what_is_stored_is_of_contact_and_reduced_size() -> None:
 
 
 @pytest.mark.parametrize("name", ["hertz", "moving"])
-def test_a_query_with_bounds_and_a_correction_evaluates_the_constraint_once(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bounds_and_a_correction_evaluate_the_constraint_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The assembly of "moving" projects it, that of Hertz takes less, and certificate and correction share one."""
     if name == "moving":
         problem, model, certificate = prepared("interpolated")

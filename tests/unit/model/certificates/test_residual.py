@@ -80,7 +80,6 @@ def test_few_directions_are_enough_for_many_terms() -> None:
 def test_a_random_range_leaves_what_it_says() -> None:
     S = np.linalg.qr(rng.standard_normal((50, 50)))[0] * 0.5 ** np.arange(50) @ rng.standard_normal((50, 80))
     found = residual._random_range(S, np.ones(S.shape[1]), 1e-3, limit=900, block=6)
-    assert found is not None
     Q, small, rest = found
     np.testing.assert_allclose(Q.T @ Q, np.eye(Q.shape[1]), atol=1e-12)
     assert np.linalg.norm(S - Q @ small) == pytest.approx(rest, rel=1e-6)
