@@ -147,12 +147,9 @@ class Block(AffineProblem):
     """
 
     def __init__(
-        self,
-        cells: Annotated[int, Ge(2), Le(12)] = 4,
-        modulus: Annotated[float, Ge(1e-12)] = 1.0,
-        size: Annotated[float, Ge(1e-9)] = 1.0,
-        lowest: float = 0.01,
-    ) -> None:
+        self, cells: Annotated[int, Ge(2), Le(12)] = 4, modulus: Annotated[float, Ge(1e-12)] = 1.0,
+        size: Annotated[float, Ge(1e-9)] = 1.0, lowest: float = 0.01,
+    ) -> None:  # fmt: skip
         self.parameters = ParameterBox(
             ("depth", "place"), np.array([lowest * size, 0.4 * size]), np.array([0.06 * size, 0.6 * size]), ("m", "m")
         )

@@ -10,22 +10,11 @@ from hypothesis import strategies as st
 from numerics import Varying, spd
 from scipy.optimize import lsq_linear
 
-from vibench import (
-    RAYS,
-    Array,
-    BlockKind,
-    Blocks,
-    DualSet,
-    InnerProduct,
-    NumericalError,
-    RequestError,
-    UnsupportedError,
-    VariationalInequality,
-    checked_assembly,
-    solve_high_fidelity,
-)
+from vibench import Array, InnerProduct, VariationalInequality, checked_assembly, solve_high_fidelity
+from vibench.errors import NumericalError, RequestError, UnsupportedError
 from vibench.highfidelity import active_set
 from vibench.highfidelity.kkt_systems import CondensedStiffness
+from vibench.interfaces.dual_sets import RAYS, BlockKind, Blocks, DualSet
 from vibench.model.bound_terms import BoundNote
 from vibench.model.error_bounds import bound_errors_at, corrected_pair, find_correction
 from vibench.model.errors import EnergyNorm

@@ -5,17 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vibench import (
-    DualStrategy,
-    Formulation,
-    HighFidelitySolver,
-    Reduction,
-    Snapshots,
-    Stop,
-    Study,
-    UnsupportedError,
-    run,
-)
+from vibench import DualStrategy, Formulation, Reduction, Snapshots, Stop, Study, UnsupportedError, run
+from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.model.error_bounds import corrected_pair
 from vibench.offline.assemblies import assemblies
 from vibench.offline.sample_problem import MovingSupport

@@ -12,17 +12,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numerics import Varying
 
-from vibench import (
-    Array,
-    HighFidelitySolver,
-    Kind,
-    NumericalError,
-    Offline,
-    ReducedSet,
-    Stop,
-    check_enrichment,
-    no_free,
-)
+from vibench import HighFidelitySolver, Kind, NumericalError, Offline, ReducedSet, Stop, check_enrichment, no_free
+from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.linalg import orthonormal_range, project_out, singular_values
 from vibench.reduction import LazyMaximum

@@ -82,16 +82,13 @@ def hashed(source: str = SOURCE, what: str = "Shape()") -> str:
 
 EDITS = {
     "body of a method": ("self.sides * width()", "self.sides + width()"),
-    "constant in a method": ('{"left", "top"}', '{"left", "bottom"}'),
-    "inherited method": ("3.0 * x", "3.5 * x"),
-    "global constant": ("LENGTH = 2.0", "LENGTH = 2.5"),
-    "global set": ('"bottom", "top"}\n', '"bottom"}\n'),
-    "function that a function calls": ("x / 2.0", "x / 4.0"),
-    "attribute of the class": ("sides = 4", "sides = 5"),
+    "constant in a method": ('{"left", "top"}', '{"left", "bottom"}'), "inherited method": ("3.0 * x", "3.5 * x"),
+    "global constant": ("LENGTH = 2.0", "LENGTH = 2.5"), "global set": ('"bottom", "top"}\n', '"bottom"}\n'),
+    "function that a function calls": ("x / 2.0", "x / 4.0"), "attribute of the class": ("sides = 4", "sides = 5"),
     "default of an argument": ("size=5", "size=6"),
     "attribute of the object": ("np.arange(size)", "np.arange(size) + 1"),
     "computed when asked for": ("sum(self.values)", "max(self.values)"),
-}
+}  # fmt: skip
 
 
 def test_fingerprints_change_with_exactly_the_edits_that_may_change_a_number() -> None:

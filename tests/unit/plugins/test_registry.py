@@ -229,25 +229,20 @@ def test_options_that_fit_reach_the_constructor_and_others_are_refused_with_what
 
 
 REFUSED = [
-    ({"weight": 0.0}, ("'weight'", "0.0", "float > 0 and < 1")),
-    ({"weight": 1.5}, ("'weight'", "1.5", "< 1")),
-    ({"weight": "half"}, ("'weight'", "'half'", "float")),
-    ({"weight": True}, ("'weight'", "True", "float")),
+    ({"weight": 0.0}, ("'weight'", "0.0", "float > 0 and < 1")), ({"weight": 1.5}, ("'weight'", "1.5", "< 1")),
+    ({"weight": "half"}, ("'weight'", "'half'", "float")), ({"weight": True}, ("'weight'", "True", "float")),
     ({"weight": float("nan")}, ("'weight'", "nan", "float")),
     ({"weight": 0.5, "count": 10}, ("'count'", "10", "int ≥ 1 and ≤ 9")),
     ({"weight": 0.5, "count": 2.0}, ("'count'", "2.0", "int")),
     ({"weight": 0.5, "mode": "quick"}, ("'mode'", "'quick'", "'slow', 'fast'")),
     ({"weight": 0.5, "grid": 1}, ("'grid'", "1", "'coarse', 'fine' or int ≥ 2")),
-    ({"weight": 0.5, "exact": 1}, ("'exact'", "1", "bool")),
-    ({"weight": 0.5, "names": []}, ("'names'", "list")),
+    ({"weight": 0.5, "exact": 1}, ("'exact'", "1", "bool")), ({"weight": 0.5, "names": []}, ("'names'", "list")),
     ({"weight": 0.5, "names": [1]}, ("'names'", "list")),
     ({"weight": 0.5, "exact": datetime.date(2022, 1, 1)}, ("'exact'", "bool")),
     ({"weight": 0.5, "wieght": 0.5}, ("'wieght'", "did you mean 'weight'")),
-    ({}, ("'weight'", "needs", "float > 0 and < 1")),
-    ({"weight": 0.5, "point": [1.0]}, ("'point'",)),
-    ({"weight": 0.5, "point": [1.0, "x"]}, ("'point'",)),
-    ({"weight": 0.5, "colour": "green"}, ("'colour'",)),
-]
+    ({}, ("'weight'", "needs", "float > 0 and < 1")), ({"weight": 0.5, "point": [1.0]}, ("'point'",)),
+    ({"weight": 0.5, "point": [1.0, "x"]}, ("'point'",)), ({"weight": 0.5, "colour": "green"}, ("'colour'",)),
+]  # fmt: skip
 
 
 @pytest.mark.usefixtures("_own")

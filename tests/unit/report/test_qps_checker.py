@@ -12,12 +12,9 @@ from vibench.report.qps_checker import residuals
 
 
 @given(
-    seed=st.integers(0, 10_000),
-    load=st.sampled_from([0.0, 1e-16, 1.0]),
-    closed=st.sampled_from([0.0, 1.0]),
-    share=st.sampled_from([0.0, 1e-7, 1.0]),
-    unit=st.integers(-9, 9),
-)
+    seed=st.integers(0, 10_000), load=st.sampled_from([0.0, 1e-16, 1.0]), closed=st.sampled_from([0.0, 1.0]),
+    share=st.sampled_from([0.0, 1e-7, 1.0]), unit=st.integers(-9, 9),
+)  # fmt: skip
 def test_residuals_are_those_of_verification(seed: int, load: float, closed: float, share: float, unit: int) -> None:
     """With a load, with one that is round-off, without; of solutions of any size, zero included."""
     rng = np.random.default_rng(seed)

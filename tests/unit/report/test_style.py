@@ -12,19 +12,9 @@ from matplotlib.figure import Figure
 
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
+from vibench.report import Layout, Looks, Series, Sheet, plot, styled
 from vibench.report.figures.data import file_names
-from vibench.report.figures.style import (
-    COLOURS,
-    Layout,
-    Looks,
-    Series,
-    Sheet,
-    caption_of,
-    look_of,
-    plot,
-    styled,
-    write_figure,
-)
+from vibench.report.figures.style import COLOURS, caption_of, look_of, write_figure
 from vibench.text import printable
 
 SOLVERS = ("piqp", "proxqp", "osqp", "clarabel", "daqp", "quadprog", "highs", "scs", "cvxopt", "ecos")

@@ -201,14 +201,10 @@ def test_what_is_no_file_of_a_study_or_invalid_toml_is_refused(tmp_path: Path) -
 
 
 INVALID = {
-    "no value": "seed =",
-    "a key twice": "seed = 1\nseed = 2",
-    "a table that becomes a list": "[problem]\n[[problem]]",
-    "no key": "= 3",
-    "an open string": "name = 'a",
-    "an endless number": "seed = " + "1" * 5000,
+    "no value": "seed =", "a key twice": "seed = 1\nseed = 2", "a table that becomes a list": "[problem]\n[[problem]]",
+    "no key": "= 3", "an open string": "name = 'a", "an endless number": "seed = " + "1" * 5000,
     "endless nesting": "a = " + "[" * 9999,
-}
+}  # fmt: skip
 
 
 def test_overrides_replace_whole_axes_and_keep_entries_with_their_name_or_label(tmp_path: Path) -> None:
