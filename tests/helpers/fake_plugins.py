@@ -27,9 +27,8 @@ class Wire(Problem):
     def __init__(self, nodes: Annotated[int, Ge(4), Le(500)] = 12, depth: float = 0.2) -> None:
         self.step, self.depth = 1.0 / (nodes + 1), depth
         ones = np.ones(nodes - 1)
-        self.stiffness = (
-            sp.csr_array(sp.diags_array([2.0 * np.ones(nodes), -ones, -ones], offsets=[0, 1, -1])) / self.step
-        )
+        bands = [2.0 * np.ones(nodes), -ones, -ones]
+        self.stiffness = sp.csr_array(sp.diags_array(bands, offsets=[0, 1, -1])) / self.step
         self.mass = sp.csr_array(sp.diags_array(np.full(nodes, self.step)))
         self.V = InnerProduct(self.stiffness + self.mass)
         self.W = InnerProduct(self.mass)

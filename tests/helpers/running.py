@@ -65,7 +65,6 @@ def started(command: list[str], folder: Path, plugins: Path) -> Iterator[subproc
 
 
 def rows(folder: Path, table: str = "cells") -> list[dict[str, Any]]:
-    """The rows of a results file, in the order they were written."""
     db = sqlite3.connect(folder / FILE)
     db.row_factory = sqlite3.Row
     try:

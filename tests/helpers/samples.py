@@ -85,7 +85,6 @@ def write_study(folder: Path, content: Mapping[str, Any] = STUDY, name: str = "s
 
 
 def filled(table: str) -> dict[str, Any]:
-    """A row in which every column has a value."""
     samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3, "BLOB": b""}
     return {name: samples[column.kind.split()[0]] for name, column in STORED[table].items()}
 

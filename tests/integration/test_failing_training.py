@@ -92,9 +92,8 @@ def test_no_more_than_a_tenth_is_skipped_and_such_cells_are_others() -> None:
         study("own", validation={"name": "sobol", "size": 4, "on_failure": "skip"})
     with pytest.raises(RequestError, match="chooses training parameters by what solutions know; it has none to skip"):
         study({"name": "greedy", "candidates": 10, "tolerance": 0.1, "on_failure": "skip"})
-    plain, skipping = (
-        expand(study({"name": "own", "on_failure": choice}, problem=["obstacle"]))[0] for choice in ("stop", "skip")
-    )
+    own = ({"name": "own", "on_failure": choice} for choice in ("stop", "skip"))
+    plain, skipping = (expand(study(one, problem=["obstacle"]))[0] for one in own)
     assert plain.key != skipping.key
     assert plain.key == expand(study("own", problem=["obstacle"]))[0].key
     for cell in (plain, skipping):

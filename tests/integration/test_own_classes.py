@@ -91,7 +91,6 @@ def run_source(folder: Path, source: str, depth: float = 0.2, *, anew: bool = Fa
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder in which the script has run, its results in `out`."""
     folder = tmp_path_factory.mktemp("script")
     count, status, rows = run_source(folder, SCRIPT, anew=True)
     assert (count, status) == (3, "ok")

@@ -19,7 +19,6 @@ seeds = st.integers(0, 10_000)
 
 
 def model(free: list[bool]) -> tuple[ReducedModel, ReducedSet]:
-    """A stable reduced model of a small problem with four generators."""
     problem = Varying(count=4)
     solved = [active_set.solve_high_fidelity(problem.assemble(mu)) for mu in problem.training_set()]
     chi = np.column_stack([s.lam for s in solved])

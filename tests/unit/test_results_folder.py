@@ -37,7 +37,6 @@ LINK = re.compile(r"\]\(([^)\s#]+)(?:#[^)]*)?\)")
 
 
 def linked(page: Path) -> set[Path]:
-    """Files of the repository that a page shows or links."""
     targets = LINK.findall(page.read_text(encoding="utf-8"))
     return {(page.parent / target).resolve() for target in targets if "://" not in target}
 
@@ -77,7 +76,6 @@ def test_one_command_makes_every_page_that_the_overview_lists() -> None:
 
 
 def rows_of(study: str, **equal: str) -> Iterator[dict[str, str]]:
-    """Cells of a committed study, with these texts in these columns."""
     with (RESULTS / study / "cells.csv").open(encoding="utf-8", newline="") as file:
         yield from (row for row in csv.DictReader(file) if all(row[name] == text for name, text in equal.items()))
 

@@ -64,7 +64,6 @@ def line_called(axes: Axes, label: str) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def both(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A results file with the models of the paper for both problems."""
     path = Path(shutil.copy(quick_run / FILE, tmp_path_factory.mktemp("published")))
     execute(path.parent, *OBSTACLE, *HERTZ)
     return path

@@ -77,7 +77,6 @@ SIZES = st.integers(12, 40), st.integers(3, 9), st.integers(1, 6), st.integers(1
 
 
 def drawn(n: int, m: int, count: int, modes: int, generators: int) -> Offline:
-    """A small problem of which hypothesis draws the dimensions."""
     return offline(Varying(n, m, count), count, modes, min(generators, count))
 
 

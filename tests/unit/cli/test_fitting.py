@@ -170,7 +170,6 @@ def test_a_cell_has_all_columns_or_is_refused(main: Main, quick_run: Path, monke
 
 
 def lines_of(action: Callable[[], object]) -> list[str]:
-    """The lines that an action prints."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
         action()
     return out.getvalue().split("\n")

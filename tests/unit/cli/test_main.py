@@ -137,9 +137,7 @@ def test_a_problem_alone_is_run_with_the_usual_choices(main: Main, tmp_path: Pat
 
 
 def test_a_strategy_in_a_file_is_a_row_of_a_run(main: Main, tmp_path: Path) -> None:
-    (tmp_path / "cone.py").write_text(
-        "from vibench_strategies.mcpg import ModifiedCPG\n\nclass Mine(ModifiedCPG):\n    pass\n"
-    )
+    (tmp_path / "cone.py").write_text("import vibench_strategies.mcpg as m\nclass Mine(m.ModifiedCPG):\n    pass\n")
     duals = ["--dual", "mcpg", "--dual", f"{tmp_path}/cone.py:Mine"]
     out = succeeded(main("run", "--problem", "obstacle", *duals, "--dry-run"))
     assert (out.count("obstacle · mcpg · "), out.count("obstacle · Mine · ")) == (8, 8)

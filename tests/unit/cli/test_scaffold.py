@@ -26,7 +26,6 @@ NAMES = {
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """One new package of every kind."""
     parent = tmp_path_factory.mktemp("new")
     return {kind: scaffold.write_package(CHECKED[kind], name, parent) for kind, name in NAMES.items()}
 

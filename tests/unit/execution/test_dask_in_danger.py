@@ -21,7 +21,6 @@ SECONDS = 300.0
 
 
 def until(holds: Callable[[], object]) -> None:
-    """Wait until something holds."""
     end = time.monotonic() + SECONDS
     while not holds():
         assert time.monotonic() < end
@@ -77,7 +76,6 @@ def here(vibench: Vibench, folder: Path, path: str) -> None:
 
 
 def on(address: str, path: str) -> list[str]:
-    """The arguments of the command that runs a study on a cluster."""
     return ["run", path, "--executor", "dask", "--scheduler", address, "--out", "dask"]
 
 
@@ -124,13 +122,11 @@ def test_a_scheduler_that_disappears_ends_the_run_which_goes_on_here(
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and what it started."""
     if process.poll() is None:
         os.killpg(process.pid, signal.SIGKILL)
 
 
 def arrived(address: str) -> int:
-    """Number of workers that a scheduler has."""
     from distributed import Client  # noqa: PLC0415  an import of half a second, in every process that collects tests
 
     with Client(address, timeout="30s", set_as_default=False) as client:

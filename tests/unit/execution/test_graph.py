@@ -15,8 +15,6 @@ from vibench.stages.base import Result, Stage
 
 @dataclass(frozen=True)
 class Node(Stage):
-    """A stage that needs others."""
-
     label = "node"
 
     name: str

@@ -38,7 +38,6 @@ STUDY = {"name": "sample", "seed": 1, "validation": 4}
 
 
 def refusal(folder: Path) -> str:
-    """The line with which a folder is refused."""
     with pytest.raises(RequestError) as caught, claimed(folder):
         pass
     return str(caught.value)
@@ -149,7 +148,6 @@ def test_an_error_above_its_bound_and_the_accuracy_of_the_reference_refutes_it()
 
 @pytest.fixture
 def study(tmp_path: Path) -> Study:
-    """A study in which every axis has a label of its own."""
     content = changed(FULL_STUDY, "problem", 0, "label", to="membrane")
     content = changed(content, "dual", to=[{"name": "mcpg", "label": "widened"}])
     content = changed(content, "primal", to=[{"name": "offline-pga", "label": "greedy"}])

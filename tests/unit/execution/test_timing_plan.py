@@ -66,7 +66,6 @@ def timed(stage: TimingRounds, unsteady: float = 0.0) -> tuple[TimedCell, ...]:
 
 
 def record(plan: TimingPlan, stage: TimingRounds | None, unsteady: float = 0.0) -> list[TimingRounds]:
-    """Record a stage and those that follow it; returns all of them."""
     stages = []
     while stage is not None:
         stages.append(stage)

@@ -40,7 +40,6 @@ STRICT = ("-std=c99", *PLAIN[1:], "-O2")
 
 
 def library(file: Path, strict: tuple[str, ...] = STRICT) -> ctypes.CDLL:
-    """A C source, compiled without a warning."""
     command = [str(COMPILER), *strict, "-shared", "-fPIC", "-o", file.with_suffix(".so"), file, "-lm"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -52,7 +51,6 @@ def pointers(*arrays: np.ndarray) -> list[Any]:
 
 
 def compiled(file: Path, unknowns: int, constraints: int, strict: tuple[str, ...] = PLAIN) -> Solve:
-    """The function of a C source: its code, x, α, residuals."""
     function = getattr(library(file, strict), f"{file.stem}_solve")
 
     def solve(mu: np.ndarray) -> Answer:
@@ -120,7 +118,6 @@ def certify(model: vibench.Model, file: Path, tolerance: float) -> tuple[Certify
 
 
 def assert_bounded(model: vibench.Model, mu: np.ndarray, u: np.ndarray, lam: np.ndarray, bounds: np.ndarray) -> None:
-    """No error of u and λ is above its bound."""
     exact, vi = model.high_fidelity(mu), model.problem.assemble(mu)
     away, force = exact.u - u, vi.B.T @ (exact.lam - lam)
     assert float(away @ (vi.A @ away)) <= bounds[0] ** 2

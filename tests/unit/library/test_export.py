@@ -105,7 +105,6 @@ def assembled_in_full(template: vibench.Model, problem: vibench.Problem, kind: v
 
 
 def with_row(template: vibench.Model, queried: Any) -> vibench.Model:
-    """A model that answers queries, with the row of a real cell."""
     offline = vibench.Reduction(queried.problem, None, None, None, None).given(assembled=queried)
     return replace(template, offline=offline, certificate=None)
 

@@ -31,7 +31,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
 
 
 def following(**calls: Any) -> Mock:
-    """An observer that counts what it is told."""
     return Mock(spec=Observer, **calls)
 
 

@@ -85,7 +85,6 @@ class Rope(Varying):
 
 @cache
 def rope(constraint: str, stiffness: str = "several") -> Rope:
-    """A rope that tests share."""
     return Rope(constraint, stiffness)
 
 
@@ -102,7 +101,6 @@ def solutions(problem: Problem, mus: tuple[tuple[float, ...], ...]) -> tuple[np.
 
 @cache
 def separation(problem: Problem) -> Mapping[str, Any]:
-    """Its members, interpolated to round-off."""
     return affine_decomposition(problem, problem.training_set(), 1e-11)
 
 

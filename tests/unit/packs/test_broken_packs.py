@@ -316,7 +316,6 @@ def test_a_mistake_has_its_line(name: str, broken: Callable[[str], Path]) -> Non
 
 
 def study_on(folder: Path, validation: int) -> Content:
-    """A study on a pack."""
     return {
         "name": "broken", "validation": validation, "solvers": ["piqp"], "dual": ["cpg"], "primal": ["decorrelated"],
         "problem": [{"name": "pack", "options": {"path": str(folder)}}], "tolerances": [{"N": [1], "R": [1]}],

@@ -86,7 +86,6 @@ MARKET = {
 
 
 def write(folder: Path, **parts: Any) -> Path:
-    """A pack whose A has these arrays."""
     np.savez(write_cable(folder) / "A.npz", **parts)
     return folder
 

@@ -22,7 +22,6 @@ VTU = """<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian
 
 
 def with_mesh(folder: Path, name: str, secret: str = "") -> Path:
-    """A pack with a mesh of this name."""
     table = write_mesh(write_cable(folder), name, secret)
     write_manifest(folder, manifest({"mesh": table}))
     return folder

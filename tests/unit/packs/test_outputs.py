@@ -13,7 +13,6 @@ FORCE = {"name": "force", "unit": "N", "lam": "outputs.npz:lam"}
 
 
 def write(folder: Path, outputs: list[dict[str, Any]]) -> Path:
-    """A pack with outputs."""
     write_manifest(write_cable(folder), manifest({"outputs": outputs}))
     np.savez(folder / "outputs.npz", u=np.arange(SIZE, dtype=float), lam=np.ones(SIZE), short=np.ones(SIZE - 1))
     return folder

@@ -129,10 +129,8 @@ def test_numbers_may_be_stored_in_few_digits(tmp_path: Path, precision: type) ->
     for dtype in (precision, np.float64):
         folder = tmp_path / str(np.dtype(dtype))
         folder.mkdir()
-        groups = {
-            name: parts | {f"{name}/data": parts[f"{name}/data"].astype(precision).astype(dtype)}
-            for name, parts in stored.items()
-        }
+        few = {name: parts[f"{name}/data"].astype(precision).astype(dtype) for name, parts in stored.items()}
+        groups = {name: parts | {f"{name}/data": few[name]} for name, parts in stored.items()}
         np.savez(folder / "spaces.npz", **groups["X_V"], **groups["X_W"])
         np.savez(folder / "more.npz", **groups["A"], **groups["B"])
         np.savez(folder / "vectors.npz", mass=mass.astype(dtype))

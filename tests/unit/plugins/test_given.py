@@ -111,9 +111,8 @@ def test_fingerprints_change_with_exactly_the_edits_that_may_change_a_number() -
 def test_processes_with_other_hash_seeds_agree(tmp_path: Path) -> None:
     """A script, `__main__`, and here a cell of a notebook in another file: one class, one fingerprint."""
     script = tmp_path / "script.py"
-    script.write_text(
-        f"{dedent(SOURCE)}\nfrom vibench.plugins.plugin import fingerprint_of\nprint(fingerprint_of(Shape()))\n"
-    )
+    last = "from vibench.plugins.plugin import fingerprint_of\nprint(fingerprint_of(Shape()))\n"
+    script.write_text(f"{dedent(SOURCE)}\n{last}")
     seeds = ({"PYTHONHASHSEED": seed} for seed in ("1", "2"))
     run = [sys.executable, str(script)]
     printed = [subprocess.check_output(run, env=os.environ | seed, text=True).strip() for seed in seeds]
@@ -133,7 +132,6 @@ def test_an_imported_module_counts_with_its_sources(tmp_path: Path, monkeypatch:
 
 @pytest.fixture(scope="module")
 def names() -> dict[str, Any]:
-    """Names of a notebook with a problem of its own."""
     source = """
         import threading
         from fake_plugins import Wire

@@ -110,7 +110,6 @@ seeds = st.integers(0, 10_000)
 
 
 def tail(snapshots: np.ndarray, basis: np.ndarray, X) -> float:
-    """Relative projection error of the definition (11)."""
     rest = snapshots - basis @ X.gram(basis, snapshots)
     return float(np.sqrt((X.norm(rest) ** 2).sum() / (X.norm(snapshots) ** 2).sum()))
 

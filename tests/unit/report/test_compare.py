@@ -37,7 +37,6 @@ def quick_run(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 @pytest.fixture
 def steady(changed: Changed, tmp_path: Path) -> Path:
-    """A run with the same seconds in every round."""
     return changed(*STEADY).rename(tmp_path / "steady.sqlite")
 
 
@@ -209,9 +208,7 @@ def test_what_many_runs_have_is_told_in_every_table_and_format(three: list[Path]
     assert list(runs["cells"]) == [12, 12, 6]
     assert set(runs["in all runs"]) == {6}
     assert list(runs["same code"]) == [12, 12, 6]
-    assert list(found.present[["steady", "server", "later"]].drop_duplicates().itertuples(index=False, name=None)) == [
-        ("yes", "yes", "no")
-    ]
+    assert found.present[["steady", "server", "later"]].drop_duplicates().to_numpy().tolist() == [["yes", "yes", "no"]]
     assert len(found.present) == 6
     values = found.values("online_s")
     assert len(values) == 12

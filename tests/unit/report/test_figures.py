@@ -32,7 +32,6 @@ Drawn = dict[str, Figure]
 
 @pytest.fixture
 def results(changed: Changed) -> Path:
-    """A copy of the results of a real run, free to be changed."""
     return changed()
 
 
@@ -48,7 +47,6 @@ def tables(quick_run: Path) -> Tables:
 
 @pytest.fixture
 def change(results: Path) -> Change:
-    """Function that runs SQL on the copy."""
     return partial(execute, results.parent)
 
 
@@ -77,7 +75,6 @@ def drawn_from(results: Path, folder: Path, *kinds: str, rendered: bool = False)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the figures of the run as it is."""
     return tmp_path_factory.mktemp("drawn") / "figures"
 
 
@@ -95,7 +92,6 @@ def draw(results: Path, tmp_path: Path) -> Draw:
 
 
 def data_of(axes: Axes) -> list[np.ndarray]:
-    """The finite values of every line with data."""
     values = [np.asarray(line.get_ydata(), float) for line in axes.get_lines()]
     return [found[np.isfinite(found)] for found in values if np.isfinite(found).any()]
 
@@ -158,9 +154,8 @@ def test_every_figure_can_be_read(drawn: Drawn, folder: Path) -> None:
         named = {label for axes in figure.axes for label in axes.get_legend_handles_labels()[1]}
         # In the legend, or beside the ends of their lines.
         written = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
-        assert named <= written | {text.get_text().replace("\n", "") for axes in figure.axes for text in axes.texts}, (
-            name
-        )
+        written |= {text.get_text().replace("\n", "") for axes in figure.axes for text in axes.texts}
+        assert named <= written, name
         assert len([one for one in panels(figure) if name.endswith("answer")]) in (0, 4), name
         places = [tuple(np.round(axes.get_position().bounds[:2], 6)) for axes in panels(figure)]
         assert max(sum(place[1] == row for place in places) for row in {place[1] for place in places}) <= 3, name
@@ -205,10 +200,8 @@ def test_convergence_and_constants_are_those_of_histories_and_queries(drawn: Dra
     np.testing.assert_array_equal(places, range(1, len(expected) + 1))
     hertz = stability(drawn["hertz-answer"])
     assert hertz.get_xlabel() == "radius µ [m]"
-    np.testing.assert_array_equal(
-        line_called(hertz, "high-fidelity").get_xdata(),
-        np.sort(queries[queries["problem"] == "hertz"]["mu_1"].unique()),
-    )
+    radii = np.sort(queries[queries["problem"] == "hertz"]["mu_1"].unique())
+    np.testing.assert_array_equal(line_called(hertz, "high-fidelity").get_xdata(), radii)
     # β over the span of the decorrelated basis is zero in this run, which a logarithmic axis cannot show
     texts = [text.get_text() for text in stability(drawn["obstacle-answer"]).texts]
     assert "β = 0: decorrelated" in texts
@@ -318,9 +311,8 @@ def test_the_tightest_enrichment_went_farthest_and_models_pay_where_lines_cross(
     cost = next(axes for axes in figure.axes if axes.get_xlabel() == "number of queries")
     (mark,) = [line for line in cost.get_lines() if line.get_marker() in "<>"]
     ((n, total),) = mark.get_xydata()
-    through = [
-        np.interp(n, *np.asarray(line.get_xydata()).T) for line in cost.get_lines() if len(line.get_xydata()) > 1
-    ]
+    data = (np.asarray(line.get_xydata()).T for line in cost.get_lines())
+    through = [np.interp(n, *xy) for xy in data if xy.shape[1] > 1]
     assert sum(np.isclose(value, total, rtol=0.02) for value in through) >= 2
     row = data.thresholds[data.thresholds["benefit_threshold"] == n]
     (interval,) = cost.collections[0].get_paths()
@@ -355,13 +347,9 @@ def test_bounds_are_drawn_against_the_errors_of_every_query_that_has_them(tables
 
 
 def errors_panel(figure: Figure) -> list[Line2D]:
-    """The points of an answer sheet, a line for every strategy."""
     panel = next(axes for axes in figure.axes if axes.get_xlabel() == "mean time of a query [ms]")
-    return [
-        line
-        for line in panel.get_lines()
-        if line.get_linestyle() == "None" and not str(line.get_label()).startswith("_")
-    ]
+    points = [line for line in panel.get_lines() if line.get_linestyle() == "None"]
+    return [line for line in points if not str(line.get_label()).startswith("_")]
 
 
 def test_without_contact_errors_of_u_are_drawn_alone(change: Change, draw: Draw) -> None:

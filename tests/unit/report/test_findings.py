@@ -17,7 +17,6 @@ def said(changed: Changed) -> Said:
 
 
 def only(texts: list[str], *words: str) -> str:
-    """The one text that has all of these words."""
     (text,) = (text for text in texts if all(word in text for word in words))
     return text
 

@@ -65,7 +65,6 @@ return texts;
 
 @pytest.fixture(scope="module")
 def made(reported: Path) -> Path:
-    """The report of a real run."""
     return reported / "report.html"
 
 
@@ -79,7 +78,6 @@ def awaited(browser: Chrome, condition: Callable[[Chrome], Any]) -> Any:
 
 
 def shown_rows(browser: Chrome, table: str = "summary") -> list[dict[str, str]]:
-    """The rows of a table as they are seen, by the headings."""
     read = """
     const table = document.querySelector(`[data-table="${arguments[0]}"] table`);
     const texts = row => [...row.cells].map(cell => cell.textContent);
@@ -90,7 +88,6 @@ def shown_rows(browser: Chrome, table: str = "summary") -> list[dict[str, str]]:
 
 
 def choose(browser: Chrome, axis: str, value: str) -> None:
-    """Choose a value in the list of an axis, as a user does."""
     labels = browser.find_elements(By.CSS_SELECTOR, '[data-table="summary"] .tools label')
     (label,) = [one for one in labels if one.text.split("\n")[0].split(" all")[0].strip() == axis]
     label.find_element(By.XPATH, f".//option[normalize-space(.)='{value}']").click()
@@ -209,16 +206,14 @@ def test_the_csv_is_what_is_shown(browser: Chrome, made: Path, downloads: Path, 
     assert [plain.get(row["primal"], row["primal"]) for row in rows] == [row["primal"] for row in shown]
     assert f"'{FORMULA}" in text
     assert f",{FORMULA}" not in text
-    assert [float(row["error u"] or "nan") for row in rows] == pytest.approx(
-        [float(row["error u"] or "nan") for row in shown], rel=1e-2, nan_ok=True
-    )
+    written, seen = ([float(row["error u"] or "nan") for row in some] for some in (rows, shown))
+    assert written == pytest.approx(seen, rel=1e-2, nan_ok=True)
 
 
 INTO_VIEW = "document.getElementById(arguments[0]).scrollIntoView()"
 
 
 def move(browser: Chrome, *places: tuple[float, float]) -> None:
-    """Move the pointer from place to place."""
     actions = ActionChains(browser)
     for x, y in places:
         actions.w3c_actions.pointer_action.move_to_location(round(x), round(y))

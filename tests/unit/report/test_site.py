@@ -151,9 +151,8 @@ def test_runs_have_data_commands(site: Path, three: list[Path], main: Main, monk
     assert f"numpy=={versions['numpy']}\n" in text
     assert {"piqp", "osqp", "proxsuite"} <= {line.split("==")[0] for line in text.splitlines()}
     evil = {"numpy": "1.0 --index-url http://x", "-r /etc/passwd": "1", "scipy": "1\n-e .", "piqp": "1.0, 2.0", "a": ""}
-    lines = requirements(
-        {**evil, "python": "3.12", "protocol": "1", "evil-package": "6.6.6"}, "code\n--pre"
-    ).splitlines()
+    evil |= {"python": "3.12", "protocol": "1", "evil-package": "6.6.6"}
+    lines = requirements(evil, "code\n--pre").splitlines()
     assert all(line.startswith("#") for line in lines)
     assert not any("evil" in line or "passwd" in line for line in lines)
     assert any(line.startswith("# left out: 3 that") for line in lines)
@@ -250,7 +249,6 @@ def test_a_label_is_no_markup(site: Path, changed: Changed, tmp_path: Path) -> N
 
 @pytest.fixture
 def small(three: list[Path], tmp_path: Path) -> Path:
-    """A site of one run."""
     return publish(three[:1], tmp_path / "small", CITATION).parent
 
 

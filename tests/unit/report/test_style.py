@@ -1,5 +1,5 @@
 import io
-from itertools import combinations
+from itertools import combinations, product
 from xml.etree import ElementTree
 
 import matplotlib as mpl
@@ -106,9 +106,7 @@ def test_line_styles_mean_the_assembly() -> None:
 
 @given(NAMES, st.lists(st.floats(0.0, 1.0), max_size=6, unique=True))
 def test_no_two_series_of_a_figure_look_the_same(names: list[str], tolerances: list[float]) -> None:
-    series = [Series(name, variant, way) for name in names for variant in ("", *tolerances) for way in ("", "reduced")][
-        :10
-    ]
+    series = [Series(*one) for one in product(names, ("", *tolerances), ("", "reduced"))][:10]
     looks = Looks(series)
     assert len({looks[one] for one in series}) == len(series)
     lines = [looks[one].line(9) for one in series]

@@ -22,7 +22,6 @@ def program(seed: int, n: int = 6, m: int = 4) -> VariationalInequality:
 
 
 def random_answer(vi: VariationalInequality, rng: np.random.Generator, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """The solution, moved by about `size`."""
     exact = solve_qp(vi, "piqp", 1e-12)
     x = exact.x * (1.0 + size * rng.standard_normal(len(vi.f)))
     return x, np.maximum(exact.alpha * (1.0 + size * rng.standard_normal(len(vi.g))), 0.0)

@@ -97,10 +97,7 @@ some = st.floats(1e-6, 0.49)
 
 @given(st.lists(st.tuples(some, some, some, st.sampled_from([0.0, 0.3])), min_size=1, max_size=8))
 def test_nobody_in_a_band_is_better_than_its_winner(found: list[tuple[float, float, float, float]]) -> None:
-    rows = [
-        row_of(str(k), error, online, offline_s=offline, beta_span_min=beta)
-        for k, (error, online, offline, beta) in enumerate(found)
-    ]
+    rows = [row_of(str(k), *one[:2], offline_s=one[2], beta_span_min=one[3]) for k, one in enumerate(found)]
     (standings,) = leaderboard(cells_of(*rows))
     for band in standings.bands:
         mine = [one for one in found if one[0] <= band.error * (1 + 1e-12)]

@@ -162,10 +162,8 @@ def test_blocks_have_medians_at_the_pace_of_their_rounds_which_nobody_alone_make
 
 def test_without_other_models_an_interval_is_students_and_other_runs_differ_by_their_conditions() -> None:
     values = [0.1, 0.3, 0.2]
-    rows = [
-        {"cell": "c", "block": str(k), "total_s": np.exp(value), "hf_s": 1.0, "pace": 1.0}
-        for k, value in enumerate(values)
-    ]
+    one = {"cell": "c", "hf_s": 1.0, "pace": 1.0}
+    rows = [one | {"block": str(k), "total_s": np.exp(value)} for k, value in enumerate(values)]
     paired = PairedTiming(rows)
     found, of_other_runs = paired.ratio_within(None, "c"), paired.ratio(None, "c")
     width = stdtrit(2, 0.975) * 0.1 / np.sqrt(3.0)

@@ -292,14 +292,12 @@ class Stranger:
 
 
 def crafted(structure: str | bytes, **arrays: Any) -> bytes:
-    """What a stranger may write."""
     text = structure.encode() if isinstance(structure, str) else structure
     found = {"structure": np.frombuffer(text, np.uint8)} if text else {}
     return safetensors.numpy.save(found | {name: np.asarray(value) for name, value in arrays.items()})
 
 
 def header(text: str, data: bytes = b"") -> bytes:
-    """A safetensors file with this header."""
     return struct.pack("<Q", len(text)) + text.encode() + data
 
 

@@ -62,7 +62,6 @@ def wire_store(register: Register, tmp_path: Path) -> SampleStore:
 
 
 def wire(interpolation: float | None, problem: Plugin = WIRE) -> CellQueries:
-    """A cell of few modes and generators."""
     found = cell(problem, "decorrelated", interpolation)
     pod, cone = PODStage(problem, Stop(tolerance=1e-2)), replace(found.built.enrichment.cone, stop=Stop(tolerance=1e-2))
     enrichment = replace(found.built.enrichment, pod=pod, cone=cone)

@@ -126,9 +126,8 @@ def test_programs_answer_say_what_they_cannot_and_are_repeated_near_by() -> None
     vi = VariationalInequality(np.eye(2), np.array([1.0, 0.0]), LIMITS, np.array([0.25, 1.0]))
     program = small_model().program()
     online = SimpleNamespace(program=lambda mu: SimpleNamespace(program=(mu, vi)))
-    model = SimpleNamespace(
-        online=online, settings=lambda _: (None, None), answered=lambda mu, _: timed(lambda: program(mu))
-    )
+    answers = {"settings": lambda _: (None, None), "answered": lambda mu, _: timed(lambda: program(mu))}
+    model = SimpleNamespace(online=online, **answers)
     query = ModelQuery(model, np.full(2, 0.5), lambda *seed: np.array([0.5, 0.5 + 1e-10 * seed[0]]), vi)  # type: ignore[arg-type]
     other = query.repeated(3, 1)
     assert other.mu[1] == other.program[0][1] == 0.5 + 3e-10  # type: ignore[index]

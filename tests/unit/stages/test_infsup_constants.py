@@ -33,7 +33,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
 
 
 def constants(store: SampleStore, problem: str, primal: str) -> list[list[InfSup]]:
-    """Own, full and plain constants at every parameter."""
     return [value_of(store, stage) for stage in cell(problem, primal).constants]
 
 

@@ -42,7 +42,6 @@ VALIDATION = ParameterSet("validation", 8, 3)
 
 
 def swept(name: str, folder: Path) -> None:
-    """The training set solved and gathered."""
     build_problem.cache_clear()
     fingerprint_here.cache_clear()
     store = Store(folder / "artefacts")

@@ -50,7 +50,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
 
 
 def as_rows(*rounds: TimedRound, hf: float | None = 4.0, pace: float = 1.0, per_block: int = 4) -> list[dict[str, Any]]:
-    """Rows of the timings table of a cell."""
     return [
         {"block": str(k // per_block), "round": k, "queries": len(one.solve), "slowdown": one.slowdown}
         | {"hf_s": hf, "pace": pace}
@@ -91,7 +90,6 @@ def test_rounds_visit_cells_in_other_orders_and_a_slow_machine_meets_all_alike()
 
 
 def _in(stage: TimingRounds) -> timing_rounds._Rounds:
-    """Rounds in progress, without the models."""
     rounds = object.__new__(timing_rounds._Rounds)
     rounds._stage = stage
     return rounds

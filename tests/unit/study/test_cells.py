@@ -22,7 +22,6 @@ Expand = Callable[[Mapping[str, Any]], list[Cell]]
 
 @pytest.fixture
 def cells_of(tmp_path: Path) -> Expand:
-    """Function that gives the cells of a study's content."""
     return lambda content: expand(read_study(write_study(tmp_path, content)))
 
 

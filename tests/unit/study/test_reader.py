@@ -17,7 +17,6 @@ JARGON = ("list[", "dict[", "literal[", "constrained", "instance of")
 
 
 def refusal(request: str, overrides: Mapping[str, Any] | None = None) -> str:
-    """The line a study is refused with."""
     with pytest.raises(RequestError) as caught:
         read_study(request, overrides)
     line = str(caught.value)
@@ -274,7 +273,6 @@ VALUES = st.recursive(
 
 
 def places(value: Any, here: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
-    """Paths to everything inside a study's content."""
     steps = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
     return [path for key, inner in steps for path in [(*here, key), *places(inner, (*here, key))]]
 

@@ -35,7 +35,6 @@ BUILT_IN = [
 
 
 def unlisted(folder: Path) -> Path:
-    """A pack whose validation parameters are drawn in the box."""
     write_manifest(write_cable(folder), manifest({"parameters.validation": ...}))
     return folder
 

@@ -138,7 +138,6 @@ FAULTS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
 
 
 def messages(plugin: object) -> dict[str, str]:
-    """The messages of the checks that fail, or warn, by their names."""
     results = testing.examine(plugin)
     return {each.check: each.message for each in results if each.verdict in (Verdict.FAILED, Verdict.WARNING)}
 

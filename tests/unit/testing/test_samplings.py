@@ -22,7 +22,6 @@ class Uniform(Sampling):
 
 
 def variant(name: str, base: type[Sampling] = Uniform, **methods: Callable[..., Any]) -> type[Sampling]:
-    """A strategy of this module with other methods."""
     return type(name, (base,), {**methods, "__module__": __name__, "__doc__": name})
 
 

@@ -116,7 +116,6 @@ Prepared = tuple[Any, HyperReducedModel, OnlineCertificate]
 
 
 def certified(problem: Problem, basis: Any, chi: Any, tolerance: float = 1e-3, eta: Any = None) -> Prepared:
-    """A model of a problem with its certificate."""
     training = problem.training_set()
     members = affine_decomposition(problem, training, tolerance)
     enrichment = Enrichment(Kind.NONE) if eta is None else Enrichment(Kind.PER_PARAMETER, eta=eta)

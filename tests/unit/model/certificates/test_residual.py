@@ -23,7 +23,6 @@ SAMPLES = np.append(DECAY, [1.0, 0.0])[:, None] * rng.standard_normal((62, 30))
 
 
 def norm(basis: ResidualBasis, z: np.ndarray) -> float:
-    """Upper bound of the dual norm of a residual."""
     coordinates, beside, missing = basis.parts(z)
     return float(np.hypot(np.linalg.norm(coordinates), beside)) * (1.0 + basis.distortion) + missing
 
