@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from fake_plugins import Wire
@@ -337,3 +338,13 @@ def test_what_strategies_and_formulations_import_late_counts(tmp_path: Path, mon
             plugin = Plugin.of(give(PluginKind[kind], name, given), {})
             read |= {*(watch_first_use(plugin, [], note=print, supervisor=supervisor, seconds=60.0) or ())}
     assert {*map(str, files)} <= read
+
+
+def test_a_run_recalls_what_its_own_plugins_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before it plans, with a process that watches those never used before."""
+    asked = Mock(side_effect=KeyboardInterrupt)
+    monkeypatch.setattr("vibench.execution.run.recall_reads", lambda plugins, *more: asked([*plugins], *more))
+    with pytest.raises(KeyboardInterrupt):
+        vibench.run(study(), tmp_path / "run", jobs=1, progress=False)
+    (plugins, _, watch) = asked.call_args.args
+    assert ([one.name for one in plugins], watch.func) == (["Wire"], watch_first_use)
