@@ -184,9 +184,8 @@ said("study.toml", lambda: read_study(str(folder / "study.toml")))
 
 @pytest.mark.long
 def test_pipes_of_others_are_refused_wherever_a_file_is_opened(run: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", PIPES, str(run)], capture_output=True, text=True, check=False, timeout=PATIENCE
-    )
+    command = [sys.executable, "-c", PIPES, str(run)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
         *(f"'results.sqlite{end}' is no regular file; remove it" for end in ("-wal", "-shm", "-journal") for _ in "12"),

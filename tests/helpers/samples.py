@@ -116,9 +116,7 @@ def query_rows(cell: str = "c1", count: int = 2, **columns: Any) -> list[dict[st
 
 FAKES: Mapping[str, Mapping[str, str]] = {
     "vibench.problems": {"wire": "Wire", "wire-raises": "Raises", "wire-broken": "Broken", "wire-sleeps": "Sleeps"},
-    "vibench.dual_strategies": {
-        "cone-needs": "NeedyCone", "cone-raises": "RaisingCone", "cone-waits": "WaitingCone",
-    },
+    "vibench.dual_strategies": {"cone-needs": "NeedyCone", "cone-raises": "RaisingCone", "cone-waits": "WaitingCone"},
     "vibench.primal_strategies": {"enrichment-counts": "CountingEnrichment"},
     "vibench.qp_solvers": {"counts": "numpy_count"} | {name.replace("_", "-"): name for name in (
         "careful", "raises", "gives_up", "wrong", "dies", "leaves", "hangs", "segfaults", "dies_sometimes", "dies_once",

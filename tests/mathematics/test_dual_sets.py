@@ -119,14 +119,9 @@ def identity_and_bounds(seed: int) -> None:
         assert e @ A @ e <= (rho2 + one @ A @ one + 2.0 * kappa) * (1.0 + 1e-12)
 
 
-@pytest.mark.parametrize("seed", range(100))
-def test_identity_and_bounds_for_any_product_of_blocks(seed: int) -> None:
-    identity_and_bounds(seed)
-
-
-@pytest.mark.long
-def test_identity_and_bounds_for_10000_products_of_blocks() -> None:
-    for seed in range(10_000):
+@pytest.mark.parametrize("seeds", [range(100), pytest.param(range(10_000), marks=pytest.mark.long)])
+def test_identity_and_bounds_for_any_product_of_blocks(seeds: range) -> None:
+    for seed in seeds:
         identity_and_bounds(seed)
 
 
@@ -170,14 +165,9 @@ def check_solution_and_bounds(seed: int) -> None:
         assert np.sqrt(force @ np.linalg.solve(vi.A.toarray(), force)) <= bounds.lambda_natural + round_off
 
 
-@pytest.mark.parametrize("seed", range(40))
-def test_solutions_with_intervals_and_their_bounds(seed: int) -> None:
-    check_solution_and_bounds(seed)
-
-
-@pytest.mark.long
-def test_solutions_with_intervals_and_their_bounds_10000_times() -> None:
-    for seed in range(10_000):
+@pytest.mark.parametrize("seeds", [range(40), pytest.param(range(10_000), marks=pytest.mark.long)])
+def test_solutions_with_intervals_and_their_bounds(seeds: range) -> None:
+    for seed in seeds:
         check_solution_and_bounds(seed)
 
 

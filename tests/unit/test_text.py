@@ -1,5 +1,3 @@
-"""Text from others: printable, in one line, of bounded length, and the same text where it was all that before."""
-
 import json
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""QP solvers on the small program: accurate, wrong, failing, hanging, and ending their process."""
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 

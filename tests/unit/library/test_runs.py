@@ -1,5 +1,3 @@
-"""Studies and runs from Python."""
-
 import builtins
 import signal
 from html import escape

@@ -278,11 +278,8 @@ changed("row in two intervals", "K: a row of the dual set is in two blocks", {"K
         {"rows": lambda c: np.array([0, 4])})  # fmt: skip
 changed("snapshots outside K", "solutions.lam leaves K by .*: in K are intervals",
         DUAL_HALF | {"K": [{"kind": "interval", "radius": 1e-3}]})  # fmt: skip
-changed(
-    "solutions outside K",
-    "does not solve the problem: A u . Bᵀλ = f is violated",
-    {"K": [{"kind": "interval", "radius": 1e-3}]},
-)
+changed("solutions outside K", "does not solve the problem: A u . Bᵀλ = f is violated",
+        {"K": [{"kind": "interval", "radius": 1e-3}]})  # fmt: skip
 
 
 @pytest.fixture

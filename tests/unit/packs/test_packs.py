@@ -1,5 +1,3 @@
-"""Model packs: what is read is what was written, in every format, and results of an edited one are not used again."""
-
 import codecs
 import gzip
 import json

@@ -1,5 +1,3 @@
-"""Reduced programs solved to round-off: KKT conditions, uniqueness of the multipliers, and what cannot be solved."""
-
 from itertools import combinations
 
 import numpy as np

@@ -177,10 +177,8 @@ def test_strict_fails(changed: Changed, steady: Path, quick_run: Path, capsys: p
     assert "0 for the worse" in capsys.readouterr().out
     compare_runs([str(quick_run), str(quick_run)], strict=True, form="csv")
     assert capsys.readouterr().out.startswith("run,against,problem,formulation,dual,primal,asked")
-    for runs, said in (
-        ([str(quick_run), "nowhere"], "no results in 'nowhere'"),
-        ([str(after)], "expected two or more"),
-    ):
+    wrong = ([str(quick_run), "nowhere"], "no results in 'nowhere'"), ([str(after)], "expected two or more")
+    for runs, said in wrong:
         with pytest.raises(RequestError, match=said):
             compare_runs(runs)
 

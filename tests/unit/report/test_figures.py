@@ -209,11 +209,8 @@ def test_convergence_and_constants_are_those_of_histories_and_queries(drawn: Dra
 
 def test_a_logarithmic_panel_with_nothing_to_show_stays_empty(change: Change, draw: Draw) -> None:
     """A strategy that records no σ, and enrichments that leave β at zero."""
-    change(
-        ONE_PAIR,
-        "DELETE FROM histories WHERE quantity = 'sigma'",
-        "UPDATE histories SET value = 0.0 WHERE quantity = 'beta_span_min'",
-    )
+    change(ONE_PAIR, "DELETE FROM histories WHERE quantity = 'sigma'")
+    change("UPDATE histories SET value = 0.0 WHERE quantity = 'beta_span_min'")
     _, _, sigma, beta = draw("convergence")["obstacle-convergence"].axes
     assert not sigma.get_lines()
     for axes in (sigma, beta):

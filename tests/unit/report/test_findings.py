@@ -1,5 +1,3 @@
-"""Findings: every sentence says what the tables say, and nothing is said that they do not support."""
-
 from collections.abc import Callable
 
 import pytest

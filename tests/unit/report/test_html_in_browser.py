@@ -114,9 +114,8 @@ def test_nothing_is_cut_or_wrapped_in_numbers(width: int, themes: tuple[str, str
         assert seen["cut"] == 0
         red = int(seen["paper"].split("(")[1].split(",")[0])
         assert red > 240 if theme == "light" else red < 40
-    pictures = browser.execute_script(
-        "return [...document.images].map(image => { image.loading = 'eager'; return image.alt.length; })"
-    )
+    eager = "return [...document.images].map(image => { image.loading = 'eager'; return image.alt.length; })"
+    pictures = browser.execute_script(eager)
     assert min(pictures) > 30
     awaited(browser, lambda b: b.execute_script("return [...document.images].every(image => image.naturalWidth > 100)"))
 

@@ -1,5 +1,3 @@
-"""What is said of a published site that somebody submits: nothing of a good one, a line for every altered file."""
-
 import importlib
 import re
 import shutil
