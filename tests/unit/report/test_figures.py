@@ -308,8 +308,8 @@ def test_the_tightest_enrichment_went_farthest_and_models_pay_where_lines_cross(
     cost = next(axes for axes in figure.axes if axes.get_xlabel() == "number of queries")
     (mark,) = [line for line in cost.get_lines() if line.get_marker() in "<>"]
     ((n, total),) = mark.get_xydata()
-    data = (np.asarray(line.get_xydata()).T for line in cost.get_lines())
-    through = [np.interp(n, *xy) for xy in data if xy.shape[1] > 1]
+    lines = (np.asarray(line.get_xydata()).T for line in cost.get_lines())
+    through = [np.interp(n, *xy) for xy in lines if xy.shape[1] > 1]
     assert sum(np.isclose(value, total, rtol=0.02) for value in through) >= 2
     row = data.thresholds[data.thresholds["benefit_threshold"] == n]
     (interval,) = cost.collections[0].get_paths()
