@@ -134,20 +134,20 @@ class Block(AffineProblem):
     hexahedra, lumped multipliers at the nodes of the top: the force per area that keeps u_z ≤ gap − depth.
     """
 
-    parameters = ParameterBox(("depth", "place"), np.array([0.01, 0.4]), np.array([0.06, 0.6]), ("m", "m"))
-
-    def __init__(self, cells: Annotated[int, Ge(2), Le(12)] = 4) -> None:
-        ticks = np.linspace(0.0, 1.0, cells + 1)
+    def __init__(self, cells: Annotated[int, Ge(2), Le(12)] = 4, modulus: float = 1.0, size: float = 1.0) -> None:
+        lower, upper = size * np.array([0.01, 0.4]), size * np.array([0.06, 0.6])
+        self.parameters = ParameterBox(("depth", "place"), lower, upper, ("m", "m"))
+        ticks = np.linspace(0.0, size, cells + 1)
         basis = Basis(MeshHex.init_tensor(ticks, ticks, ticks), ElementVector(ElementHex1()))
-        free = basis.complement_dofs(basis.get_dofs(lambda x: x[2] < 1e-6))
-        top = basis.mesh.facets_satisfying(lambda x: x[2] > 1.0 - 1e-6)
+        free = basis.complement_dofs(basis.get_dofs(lambda x: x[2] < 1e-6 * size))
+        top = basis.mesh.facets_satisfying(lambda x: x[2] > (1.0 - 1e-6) * size)
         contact = fem.normal_constraint(basis, top, free=free)
-        elasticity = linear_elasticity(0.3 / (1.3 * 0.4), 1.0 / 2.6)  # ν = 0.3
-        self.V, self.W = InnerProduct(fem.h1_gram(basis, free)), contact.W
+        elasticity = linear_elasticity(modulus * 0.3 / (1.3 * 0.4), modulus / 2.6)  # ν = 0.3
+        self.V, self.W = InnerProduct(fem.h1_gram(basis, free, size)), contact.W
         x, y = contact.points[:2]
-        # The gap below the paraboloid, ((x − place)² + (y − ½)²)/2 − depth, in powers of the place.
-        gap = 0.5 * (x**2 + (y - 0.5) ** 2)
-        g = [(1.0, gap), ("place", -x), ("place**2", np.full_like(x, 0.5)), ("-depth", np.ones_like(x))]
+        # The gap below the paraboloid, ((x − place)² + (y − size/2)²)/(2 size) − depth, in powers of the place.
+        gap = (x**2 + (y - 0.5 * size) ** 2) / (2.0 * size)
+        g = [(1.0, gap), ("place", -x / size), ("place**2", np.full_like(x, 0.5 / size)), ("-depth", np.ones_like(x))]
         self.declare(
             A=elasticity.assemble(basis), f=np.zeros(basis.N), B=contact.B,
             g=[(theta, contact.bound(values)) for theta, values in g], free=free,
