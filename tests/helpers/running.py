@@ -159,7 +159,6 @@ def numbers(folder: Path) -> dict[str, pd.DataFrame]:
 
 
 def without_seconds(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row without seconds, memory, and what follows from them."""
     return {name: row[name] for name in row if not name.endswith((*MEASURED, "timing_rounds", "timing_reason"))}
 
 
