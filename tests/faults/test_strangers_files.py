@@ -1,5 +1,3 @@
-"""Files of strangers: artefacts, results and links that somebody else has put in place do no harm."""
-
 import hashlib
 import os
 import pickle

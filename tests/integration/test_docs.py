@@ -1,5 +1,3 @@
-"""The documentation is true: its code runs, its tables are complete, its rules are those that studies are held to."""
-
 import contextlib
 import copy
 import importlib

@@ -1,5 +1,3 @@
-"""The example package: installed as a third party's, found by its entry points, run beside the built-in ones."""
-
 import shutil
 import subprocess
 import sys

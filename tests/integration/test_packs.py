@@ -1,5 +1,3 @@
-"""Studies on packs give the numbers of problems; packs are found beside the study, moved ones where the user says."""
-
 import shutil
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,3 @@
-"""Errors of quantities of interest: by hand on a few numbers, zeros apart, and one line for what is wrong."""
-
 from dataclasses import replace
 
 import numpy as np

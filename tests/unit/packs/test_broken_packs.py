@@ -1,5 +1,3 @@
-"""Packs with one mistake that an exporting user may make: each has a line of its own, and none runs."""
-
 import gzip
 import io
 import os

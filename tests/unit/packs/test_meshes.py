@@ -1,5 +1,3 @@
-"""Meshes of others: formats of one file, read in a process whose memory and seconds are limited."""
-
 import base64
 import os
 import zlib

@@ -1,5 +1,3 @@
-"""Natural KKT residuals: what they are, what they do not depend on, and what they find."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""The report in a real browser: what it shows at desktop and phone width, in light and dark, and what it does."""
-
 import contextlib
 import csv
 import io
