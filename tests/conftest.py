@@ -16,12 +16,12 @@ settings.load_profile("same")
 
 
 LONGEST = (
-    "test_borders", "test_misbehaviour", "report/test_figures", "test_executors", "test_docs", "test_other_problems",
+    "test_borders", "test_misbehaviour", "report/test_figures", "test_executors", "test_docs",
     "test_example_rope", "test_hertz3d", "test_conformance", "test_machines", "test_html_in_browser",
     "test_results_folder", "test_run", "test_supervisor", "test_c_source", "test_scaffold",
-    "test_interruptions", "test_text_from_others", "test_error_bounds", "test_html", "test_site", "test_keys",
+    "test_interruptions", "test_error_bounds", "test_html", "test_site", "test_keys",
     "test_paper_figures", "test_export", "test_invariance", "test_obstacle", "test_benchmarks", "test_any_text",
-    "test_compare", "test_findings", "test_damaged_files", "test_own_classes", "test_packs", "test_as_published",
+    "test_compare", "test_findings", "test_damaged_files", "test_packs", "test_as_published",
     "test_outputs_in_danger", "test_compilation", "test_correction", "test_faults", "test_formulations", "test_bounds",
     "test_other_codes", "test_database", "test_end_to_end",
 )  # fmt: skip

@@ -102,8 +102,7 @@ def measure_queries(sides: Pair, mus: Array) -> tuple[Seconds, Figures]:
         worst = max(map(sides.ours.compiled_residual, mus))
         found[f"largest residual, {COMPILED}"] = Pair(worst, worst)
         seconds[COMPILED] = Pair(
-            seconds[QUERIES[-1]].published,
-            [median_seconds(partial(sides.ours.compiled, mu))[1].cpu for mu in mus],
+            seconds[QUERIES[-1]].published, [median_seconds(partial(sides.ours.compiled, mu))[1].cpu for mu in mus]
         )
         _tell(COMPILED, seconds[COMPILED])
     return seconds, found

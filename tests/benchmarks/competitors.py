@@ -9,8 +9,6 @@ phases are those of the study `formulations`. Exit code 1 if a query of ours tak
 is as accurate: with a dictionary, whose generators depend on each other, the plain `proximal` does not converge.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 import vibench
-from vibench.arrays import Array
+from vibench import Array
 from vibench.library.reduced_model import Model
 from vibench.offline.models import Model as LibraryModel
 from vibench.offline.polynomials import TOLERANCE

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from vibench.library.runs import open_run
+from vibench import open_run
 from vibench.report.differences import Agreement, agreement
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
 from vibench.results.paired_timing import PairedTiming

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import published
 
-from vibench import Array, CompiledModel, CompiledProgram, Problem, Reduction, Stop, UnsupportedError
-from vibench.qp.solve import solve_qp
-from vibench.qp.verification import kkt_residuals
+from vibench import Array, CompiledModel, CompiledProgram, Problem, Reduction, Stop, UnsupportedError, solve_qp
+from vibench.qp import kkt_residuals
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG

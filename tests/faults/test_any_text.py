@@ -15,7 +15,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numerics import exact
-from odd_plugins import LABEL, ODD
 from outputs import clean, elements
 from samples import cell_row, filled, query_rows
 
@@ -31,6 +30,9 @@ from vibench.results.read import in_order, read_table
 from vibench.results.schema import STORED, TABLES
 from vibench.results.sqlite import FILE
 from vibench.stages.query import ProgramQuery, run_query
+
+LABEL = "=1+1 [/b] [red] $x^{ $ `a` | <img src=x onerror=alert(1)> </script> \x1b[31m\n@ [x](javascript:y)"
+ODD = f"{LABEL} \ud800"
 
 ANYTHING = st.text(st.characters(), max_size=50) | st.sampled_from([LABEL, ODD, "$$", "_", "[/b]", "=1", "|", "\\", ""])
 """All of Unicode, lone surrogates included."""

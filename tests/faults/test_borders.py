@@ -89,9 +89,7 @@ def test_what_a_sampling_does_to_the_process_of_the_command_is_undone() -> None:
             assert before == (sys.path, np.geterr(), signal.getsignal(signal.SIGTERM), os.environ), how
 
 
-def test_buffers_are_judged_by_what_they_held_and_work_in_reconstruct_is_of_the_query(
-    beside: Beside,
-) -> None:
+def test_buffers_are_judged_by_what_they_held_and_work_in_reconstruct_is_of_the_query(beside: Beside) -> None:
     cells = beside("formulation", "pair-buffer", "reconstruct-solves").table("cells").set_index("formulation")
     for name in ("error_u_mean", "error_lambda_mean"):
         assert cells.loc["pair-buffer", name] == cells.loc["Honest", name]

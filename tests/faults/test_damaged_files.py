@@ -12,7 +12,7 @@ import pytest
 from running import Main, execute, rows
 from samples import write_study
 
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.execution import run  # noqa: F401  lists the classes of all stages
 from vibench.report.comparison import compare
 from vibench.results.database import ResultsDatabase

@@ -1,5 +1,3 @@
-"""Runs that are killed at random moments, and full disks: nothing is lost, and a later run completes the rest."""
-
 import contextlib
 import os
 import random
@@ -118,10 +116,7 @@ def test_a_run_that_is_killed_again_and_again_loses_and_doubles_nothing(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("kib", "length"),
-    [*((kib, "long") for kib in (1, 12, 40, 100, 300)), (100, "short")],
-)
+@pytest.mark.parametrize(("kib", "length"), [*((kib, "long") for kib in (1, 12, 40, 100, 300)), (100, "short")])
 def test_a_full_disk_stops_a_run_with_one_line_and_a_later_one_completes_it(
     kib: int, length: str, undisturbed: Callable[[str], Undisturbed], vibench: Vibench, place: Path
 ) -> None:

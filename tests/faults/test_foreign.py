@@ -13,7 +13,7 @@ from unittest.mock import Mock
 import pytest
 from running import PATIENCE
 
-from vibench.errors import UnsupportedError
+from vibench import UnsupportedError
 from vibench.offline import compiled
 from vibench.provenance import distribution_version, solver_version
 

@@ -1,5 +1,3 @@
-"""Machines with odd limits, and odd things beside a study."""
-
 from __future__ import annotations
 
 import re
@@ -60,7 +58,7 @@ def test_a_run_does_not_depend_on_asserts_letters_of_an_encoding_nor_folders_cal
     assert found == {"piqp": "ok", "careful": "ok", "ecos": "unavailable"}
 
 
-def test_a_distribution_with_unreadable_entry_points_costs_its_own(
+def test_unreadable_entry_points_cost_their_own(
     vibench: Vibench, plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     site = tmp_path / "site"

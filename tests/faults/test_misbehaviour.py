@@ -1,143 +1,12 @@
-"""Problems and QP solvers of a third party that misbehave in every way, by the command."""
+"""Solvers of a third party that misbehave, by the command; how each is judged is in tests of trials and borders."""
 
-import re
-import subprocess
-from collections.abc import Mapping
-from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
-from typing import Any
 
-import pandas as pd
+import fake_plugins
+import meddling
 import pytest
-from running import Vibench, rows, run_wire
-from samples import wire_study, write_study
-
-from vibench.provenance import solver_version
-
-BAD_PROBLEMS: Mapping[str, tuple[set[str], str]] = {
-    "wire-raises": ({"error"}, "]: ArithmeticError: the wire snapped"),
-    "wire-broken": ({"error"}, "in high-fidelity solutions: the problem 'wire-broken' raised OSError: no wire "),
-    "wire-hungry": ({"error"}, "out of memory: the limit is memory_gib = 8"),
-    "wire-sleeps": ({"timeout"}, "in high-fidelity solutions: stopped after cell_seconds = 20 s"),
-    "wire-exits": ({"crashed"}, "in high-fidelity solutions: the worker process died with exit code 3"),
-    "wire-segfaults": ({"crashed"}, "in high-fidelity solutions: the worker process died with signal SIGSEGV"),
-    "wire-infeasible": ({"error"}, "]: rows 3 and 9 of B are opposite, and no u satisfies both of their bounds g"),
-}
-BAD_SOLVERS: Mapping[str, tuple[set[str], str]] = {
-    "raises": ({"failed"}, "the solver returned nothing: RuntimeError: the solver gave in"),
-    "nothing": ({"error"}, "NumericalError: the solver returned a NoneType, expected a QPSolution"),
-    "gives-up": ({"failed"}, "the solver returned nothing: gave up"), "nan": ({"nonfinite"}, "not finite"),
-    "wrong": ({"inaccurate"}, "residual"), "wrong-length": ({"error"}, "3 of 3 queries"),
-    "dies": ({"crashed"}, "exit code 7"), "segfaults": ({"crashed"}, "died with signal SIGSEGV"),
-    "hangs": ({"timeout"}, "stopped after query_seconds = 3 s"),
-    "hungry": ({"error"}, "out of memory: the limit is memory_gib = 8"), "leaves": ({"error"}, "SystemExit: 3"),
-    # Where its distribution is installed the broken module is the reason.
-    "ecos": ({"unavailable"}, f"'ecos' {'cannot be imported: ' if solver_version('ecos') else 'is not installed: '}"),
-}  # fmt: skip
-FINE: Mapping[str, list[str]] = {
-    "problem": ["wire", "wire-chatty"], "dual": ["cpg"], "primal": ["decorrelated", "enrichment-counts"],
-    "solver": ["piqp", "careful", "counts", "chatty"],
-}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Run:
-    folders: list[Path]
-    done: list[subprocess.CompletedProcess[str]]
-
-    def rows(self, table: str = "cells") -> list[dict[str, Any]]:
-        return [row for folder in self.folders for row in rows(folder, table)]
-
-
-@pytest.fixture(scope="module")
-def run(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Matrices in which almost everything goes wrong: of problems and of solvers."""
-    folder = tmp_path_factory.mktemp("misbehaviour")
-    limits = {"cell_seconds": 20.0, "query_seconds": 3.0}  # a busy machine may take seconds for what is fine
-    studies = [
-        {"problem": [*FINE["problem"], *BAD_PROBLEMS], "dual": FINE["dual"], "primal": FINE["primal"],
-         "solvers": FINE["solver"]},
-        {"solvers": [*FINE["solver"], *BAD_SOLVERS]},
-    ]  # fmt: skip
-    found = Run([], [])
-    for number, study in enumerate(studies):
-        path = write_study(folder, wire_study(limits=limits, timing_rounds=2, **study), f"{number}.toml")
-        found.done.append(vibench(folder, "run", path, "--jobs", "2", "--out", str(number)))
-        found.folders.append(folder / str(number))
-    return found
-
-
-@pytest.fixture(scope="module")
-def cells(run: Run) -> pd.DataFrame:
-    found = pd.DataFrame(run.rows()).set_index(["problem", "dual", "primal", "solver"])
-    return found[~found.index.duplicated()].sort_index()
-
-
-@pytest.mark.long
-def test_every_cell_has_a_row_with_a_reason_of_one_line_and_its_origin(cells: pd.DataFrame, run: Run) -> None:
-    problems = ([*FINE["problem"], *BAD_PROBLEMS], FINE["dual"], FINE["primal"], FINE["solver"])
-    solvers = (["wire"], FINE["dual"], ["decorrelated"], [*FINE["solver"], *BAD_SOLVERS])
-    expected = {cell for axes in (problems, solvers) for cell in product(*axes)}
-    assert sorted(cells.index) == sorted(expected)
-    assert [(one.returncode, one.stderr) for one in run.done] == [(0, "")] * 2
-    reasons = [*cells["reason"], *(row["reason"] for row in run.rows("queries"))]
-    assert [reason for reason in reasons if "\n" in reason] == []
-    assert all(cells["reason"][cells["status"] != "ok"])
-    for name in ("seed", "study_hash", "code", "machine", "threads", "versions"):
-        assert cells[name].notna().all(), name
-        assert (cells[name] != "").all(), name
-
-
-@pytest.mark.long
-def test_tables_progress_and_logs_have_what_happened(run: Run) -> None:
-    outputs = [one.stdout for one in run.done]
-    for folder, printed in zip(run.folders, outputs, strict=True):
-        counted = [(int(k), int(n)) for k, n in re.findall(r"^\[(\d+)/(\d+)\]", printed, re.MULTILINE)]
-        statuses = [row["status"] for row in rows(folder)]
-        count, fine = len(statuses), statuses.count("ok")
-        assert counted == sorted(counted)
-        assert len(set(counted)) == len(counted) > 5
-        assert {n for _, n in counted} == {count}
-        assert f"{count} cells, {fine} ok, {count - fine} not ok" in printed
-        for status in set(statuses) - {"ok"}:
-            assert re.search(rf"\b{status}: ", "".join(outputs))  # ten reasons of a run have a line
-        assert len(pd.read_csv(folder / "tables" / "cells.csv")) == count
-        assert len((folder / "tables" / "summary.md").read_text(encoding="utf-8").splitlines()) == count + 2
-        assert len(pd.read_csv(folder / "tables" / "queries.csv")) == len(rows(folder, "queries"))
-    queries = pd.DataFrame(rows(run.folders[1], "queries"))
-    solvers = {*FINE["solver"], "raises", "nothing", "gives-up", "nan", "wrong"}
-    assert solvers <= set(queries["solver"])
-    assert set(queries.groupby("cell")["query"].apply(tuple)) == {(0, 1, 2)}
-    assert set(queries[queries["solver"] == "raises"]["status"]) == {"failed"}
-    assert queries["mu_1"].between(4.0, 8.0).all()
-    counts = [row["iterations"] for row in run.rows("queries") if row["solver"] == "counts"]
-    assert counts
-    assert set(counts) == {3}
-    known = [row for row in rows(run.folders[0], "histories") if row["quantity"] == "steps"]
-    assert [row["value"] for row in known if row["problem"] == "wire"] == [0, 1, 2]
-    assert not any(words in printed for printed in outputs for words in ("past Python", "the last words"))
-    logs = [(folder / "workers.log").read_text() for folder in run.folders]
-    said = (
-        "assembling [", "careful", "written past Python", "solving", "solving past Python", "Fatal Python error: Seg",
-    )  # fmt: skip
-    assert [words for words in said if words not in logs[0]] == []
-    assert all("the last words" in log for log in logs)  # printed by what crashed right after
-
-
-@pytest.mark.long
-def test_a_plugin_that_misbehaves_costs_its_cells_alone_and_is_named(cells: pd.DataFrame) -> None:
-    fine = cells.loc[list(pd.MultiIndex.from_product(FINE.values()))]
-    assert set(fine["status"]) == {"ok"}
-    assert set(fine["queries_ok"]) == {3}
-    assert set(fine["reason"]) == {""}
-    for plugin, (statuses, reason) in {**BAD_PROBLEMS, **BAD_SOLVERS}.items():
-        mine = cells.xs(plugin, level="problem" if plugin in BAD_PROBLEMS else "solver")
-        assert set(mine["status"]) == statuses, plugin
-        assert all(reason in found for found in mine["reason"]), plugin
-        if plugin in BAD_SOLVERS:
-            assert set(mine["queries_ok"]) == {0}
-            assert mine["online_s"].isna().all()
+from running import Vibench, by_solver, execute, rows, run_wire, without_seconds
+from samples import FAKES, ROUNDS, install, wire_study, write_study
 
 
 @pytest.mark.long
@@ -152,9 +21,12 @@ def test_a_large_problem_that_finds_no_memory_costs_its_cell_alone(vibench: Vibe
 
 
 def test_queries_that_went_well_before_the_solver_died_are_kept(vibench: Vibench, tmp_path: Path) -> None:
-    study = wire_study(solvers=["dies-sometimes", "piqp"], tolerances=[{"N": [3], "dual": [1e-2]}])
+    study = wire_study(solvers=["dies-sometimes", "chatty"], tolerances=[{"N": [3], "dual": [1e-2]}])
     done = vibench(tmp_path, "run", write_study(tmp_path, study), "--jobs", "1", "--out", "out")
     assert (done.returncode, done.stderr) == (0, "")
+    said = "solving", "solving past Python"
+    assert not any(words in done.stdout for words in said)
+    assert all(words in (tmp_path / "out" / "workers.log").read_text() for words in said)
     cell, other = rows(tmp_path / "out")
     assert (cell["status"], cell["queries_ok"]) == ("crashed", 1)
     assert cell["reason"].startswith("2 of 3 queries, first mu=(4.343): the worker process died with signal SIGKILL")
@@ -164,3 +36,108 @@ def test_queries_that_went_well_before_the_solver_died_are_kept(vibench: Vibench
     for query, reference in zip(lost, kept, strict=True):
         for name in ("mu_1", "hf_s", "beta_span", "beta_full_cone_lower", "beta_hf_span", "beta_bounds"):
             assert query[name] == reference[name]
+
+
+ANSWERS = 6
+"""Calls of the solver before the timing begins: two for each of three queries."""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("last_call", "lost"), [(ANSWERS + 1, 1), (ANSWERS + 1 + ROUNDS, 1), (ANSWERS, 0)])
+def test_a_death_costs_its_round(
+    last_call: int, lost: int, vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where it dies at an answer, in the last case, it costs that query and no round of the others."""
+    monkeypatch.setenv("FAKE_CALLS", str(tmp_path / "calls"))
+    monkeypatch.setenv("FAKE_LAST_CALL", str(last_call))
+    run_wire(vibench, tmp_path, study=wire_study(solvers=["dies-once", "piqp"]))
+    found = by_solver(tmp_path / "runs" / "wire")
+    unlucky, other = found["dies-once"], found["piqp"]
+    assert (unlucky["status"], unlucky["queries_ok"]) == (("ok", 3) if lost else ("crashed", 2))
+    assert (other["status"], other["timing_reason"]) == ("ok", "")
+    reason = f"{lost} of {ROUNDS} rounds: the worker process died with signal SIGKILL" if lost else ""
+    assert unlucky["timing_reason"] == reason
+    assert min(unlucky["online_s"], other["online_s"]) > 0.0
+    timed = [row["solver"] for row in rows(tmp_path / "runs" / "wire", "timings")]
+    assert (timed.count("dies-once"), timed.count("piqp")) == (ROUNDS - lost, ROUNDS)
+
+
+@pytest.mark.long
+def test_what_was_never_answered_or_timed_leaves_the_others_or_is_timed_next(vibench: Vibench, tmp_path: Path) -> None:
+    study = wire_study(solvers=["dies", "raises", "piqp"], dual=["cone-raises", "cpg"])
+    (tmp_path / "other").mkdir()
+    found = {(row["dual"], row["solver"]): row for row in run_wire(vibench, tmp_path / "other", study=study)[1]}
+    assert len(found) == 6
+    assert [key for key, row in found.items() if row["online_s"] is not None] == [("cpg", "piqp")]
+    assert found["cpg", "piqp"]["timing_rounds"] == ROUNDS
+    # As after an interruption between the last answer and the first round; a study may ask for more rounds.
+    folder = tmp_path / "runs" / "wire"
+    run_wire(vibench, tmp_path, study=wire_study())
+    execute(folder, "UPDATE cells SET timing_rounds = NULL, online_s = NULL", "DELETE FROM timings")
+    printed, (row,) = run_wire(vibench, tmp_path)
+    assert "1 cells, 0 to run, 1 stages" in printed
+    assert row["online_s"] > 0.0
+    assert len(rows(folder, "timings")) == ROUNDS
+    assert "1 cells, 0 to run, 0 stages" in run_wire(vibench, tmp_path)[0]
+    assert {row["meaning"] for row in rows(folder, "thresholds")} == {"undecided"}
+    assert "0 to run, 1 stages" in run_wire(vibench, tmp_path, study=wire_study(timing_rounds=7))[0]
+    assert len(rows(folder, "timings")) == 7
+    assert {row["timing_rounds"] for row in rows(folder)} == {7}
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = install(tmp_path_factory.mktemp("site") / "both", fake_plugins, FAKES)
+    return add(folder, tmp_path_factory, meddling.MEMBERS)
+
+
+def add(folder: Path, temporary: pytest.TempPathFactory, members: dict[str, dict[str, str]]) -> Path:
+    for part in install(temporary.mktemp("apart") / "site", meddling, members).iterdir():
+        part.rename(folder / part.name)
+    return folder
+
+
+@pytest.mark.long
+def test_a_package_that_meddles_with_its_process_costs_no_other(vibench: Vibench, both: Path, tmp_path: Path) -> None:
+    """One worker process would serve them all; the rounds of the solvers are interleaved."""
+    write_study(tmp_path, wire_study(problem=["wire-meddles", "wire"], solvers=["meddling", "roughly", "piqp"]))
+    write_study(tmp_path, wire_study(), "alone.toml")
+    done = vibench(tmp_path, "run", "study.toml", "--jobs", "1", "--out", "both", plugins=both)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert vibench(tmp_path, "run", "alone.toml", "--jobs", "1", "--out", "alone", plugins=both).returncode == 0
+    found = {(row["problem"], row["solver"]): row for row in rows(tmp_path / "both")}
+    (expected,) = rows(tmp_path / "alone")
+    for key in [key for key in found if key[0] == "wire-meddles"]:
+        assert found[key]["status"] == "error"
+        assert "File too large; a plugin limits or closes the files of its process" in found[key]["reason"]
+    good, bad, rough = (found["wire", solver] for solver in ("piqp", "meddling", "roughly"))
+    ignored = {"rowid", "study", "study_hash"}
+    for name in without_seconds(expected).keys() - ignored:
+        assert good[name] == expected[name], name
+    for row in (good, bad):
+        assert (row["status"], row["timing_rounds"], row["timing_reason"]) == ("ok", ROUNDS, "")
+        assert row["online_s"] > 0.0
+    assert rough["status"] == "ok"
+    assert "in other units of the unknowns" in rough["timing_reason"]
+    assert "does the solver remember answers?" in rough["timing_reason"]
+
+
+@pytest.mark.long
+def test_a_name_of_two_packages(vibench: Vibench, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    site = add(install(tmp_path / "site", fake_plugins, FAKES), tmp_path_factory, meddling.TAKEN)
+    study = wire_study(dual=["cpg", "mcpg"], solvers=["piqp", "careful", "osqp", "counts"])
+    found = {(row["dual"], row["solver"]): row for row in run_wire(vibench, tmp_path, study=study, plugins=site)[1]}
+    ok = {key for key, row in found.items() if row["status"] == "ok"}
+    assert ok == {("mcpg", "piqp"), ("mcpg", "counts")}
+    assert {row["status"] for key, row in found.items() if key not in ok} == {"unavailable"}
+    reason = found["cpg", "piqp"]["reason"]
+    assert reason.startswith("two packages provide the dual strategy 'cpg', so that none is used: ")
+    assert "meddling 1.0 (meddling:Meddles)" in reason
+    assert "(vibench_strategies.cpg:CPG)" in reason
+    assert "fake-plugins 1.0 (fake_plugins:careful)" in found["mcpg", "careful"]["reason"]
+    assert "'osqp', so that none is used: qpsolvers, meddling 1.0" in found["mcpg", "osqp"]["reason"]
+    listed = vibench(tmp_path, "list", plugins=site)
+    assert (listed.returncode, listed.stderr) == (0, "")
+    words = " ".join(listed.stdout.split())
+    for name in ("'cpg'", "'careful'", "'osqp'"):
+        assert f"{name}, so that none" in words or name in words

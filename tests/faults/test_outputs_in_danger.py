@@ -1,4 +1,4 @@
-"""Sites, exports and reports that are killed, that find a full disk, links in a circle, or folders of another user."""
+"""Sites and reports that find a full disk, links in a circle, or folders of another user."""
 
 import os
 import random
@@ -9,13 +9,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from forking import forked
 from running import Main, Vibench, rows
 from sample_run import write_sample_run
 from samples import wire_study, write_study
 
-from vibench.library.runs import Run
-from vibench.report import site as folder
 from vibench.results.sqlite import FILE
 
 
@@ -25,7 +22,7 @@ def run(tmp_path: Path) -> Path:
 
 
 @pytest.mark.long
-def test_sites_on_full_disks_or_killed_are_whole_or_not_there(run: Path, vibench: Vibench, tmp_path: Path) -> None:
+def test_sites_on_full_disks_are_not_there(run: Path, vibench: Vibench, tmp_path: Path) -> None:
     for kib in (20, 600):
         done = vibench(tmp_path, "publish", str(run), str(tmp_path / "site"), "--no-figures", "--yes", file_kib=kib)
         assert done.returncode == 2, done.stderr
@@ -33,41 +30,6 @@ def test_sites_on_full_disks_or_killed_are_whole_or_not_there(run: Path, vibench
         assert "cannot be written" in done.stderr
         assert done.stderr.count("\n") == 1
         assert {path.name for path in tmp_path.iterdir()} == {"run"}
-    rng, site = random.Random(8), tmp_path / "site"
-    arguments = ["publish", str(run), str(site), "--no-figures", "--yes"]
-    start = time.monotonic()
-    assert vibench(tmp_path, *arguments).returncode == 0
-    seconds, whole = time.monotonic() - start, sorted(path.name for path in site.rglob("*"))
-    shutil.rmtree(site)
-    for kill in range(2):
-        with forked(arguments, tmp_path, tmp_path) as process:
-            time.sleep(rng.random() * seconds)
-            process.kill()
-        if site.exists():
-            assert sorted(path.name for path in site.rglob("*")) == whole, kill
-            folder.check(site)
-        for left in tmp_path.glob("vibench-*"):
-            shutil.rmtree(left)
-    done = vibench(tmp_path, *arguments)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert sorted(path.name for path in site.rglob("*")) == whole
-
-
-@pytest.mark.long
-def test_an_export_that_is_killed_is_whole_or_not_there(small_run: Run, vibench: Vibench, tmp_path: Path) -> None:
-    rng, run = random.Random(9), str(small_run.path.parent)
-    key = small_run.cells.set_index(["problem", "assembly"]).loc[("radial-obstacle", "reduced"), "cell"].iloc[0]
-    for arguments, made in (
-        (["export", run, "set"], tmp_path / "set" / "check.py"),
-        (["export", run, key, "model.npz"], tmp_path / "model.npz"),
-    ):
-        start = time.monotonic()
-        assert vibench(tmp_path, *arguments[:-1], f"whole-{arguments[-1]}").returncode == 0
-        seconds = time.monotonic() - start
-        with forked(arguments, tmp_path, tmp_path) as process:
-            time.sleep(rng.random() * seconds)
-            process.kill()
-        assert made.exists() == (tmp_path / arguments[-1]).exists()
 
 
 LOOPS = (

@@ -1,5 +1,3 @@
-"""Files of strangers: artefacts, results and links that somebody else has put in place do no harm."""
-
 import hashlib
 import os
 import pickle
@@ -14,8 +12,8 @@ from typing import Any
 import pytest
 from running import PATIENCE, execute
 
+from vibench import NumericalError, RequestError
 from vibench.cli.result_commands import export, replay_query, show, write_report
-from vibench.errors import NumericalError, RequestError
 from vibench.execution.recording import REPORT, claimed
 from vibench.files import locked, write_atomically
 from vibench.report import figures
@@ -184,9 +182,8 @@ said("study.toml", lambda: read_study(str(folder / "study.toml")))
 
 @pytest.mark.long
 def test_pipes_of_others_are_refused_wherever_a_file_is_opened(run: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", PIPES, str(run)], capture_output=True, text=True, check=False, timeout=PATIENCE
-    )
+    command = [sys.executable, "-c", PIPES, str(run)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
         *(f"'results.sqlite{end}' is no regular file; remove it" for end in ("-wal", "-shm", "-journal") for _ in "12"),

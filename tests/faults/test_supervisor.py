@@ -1,5 +1,3 @@
-"""Worker processes that hang, die or are told to stop: what is kept, what is said, and how soon."""
-
 import contextlib
 import itertools
 import os
@@ -16,12 +14,12 @@ import pytest
 from fake_stages import InItems, OfAPlugin, Whole
 from running import PATIENCE
 
+from vibench import Status
 from vibench.execution import supervisor
 from vibench.execution.supervisor import Begun, CurrentItem, Job, StoppedError, Supervisor
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
-from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Stage, Unstored
 

@@ -53,8 +53,6 @@ def changed(module: str, name: str, member: str, wrong: Callable[..., Any], base
 
 
 def built(module: str, name: str, base: Any = Wire, **members: Callable[[Any], Any]) -> Any:
-    """A problem of which members are replaced when it is made."""
-
     def init(self: Any) -> None:
         base.__init__(self)
         for member, made in members.items():
@@ -183,8 +181,6 @@ class CountsInstances(Wire):
 
 
 class OneBuffer(Wire):
-    """Every load is written into the same vector."""
-
     def __init__(self) -> None:
         super().__init__()
         self._load = np.zeros(self.V.dim)

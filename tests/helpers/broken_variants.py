@@ -44,15 +44,11 @@ class Bar(Own):
 
 
 class Option(Put):
-    """A coarse put."""
-
     def __init__(self) -> None:
         super().__init__(cells=24)
 
 
 class Cube(Own):
-    """A coarse block."""
-
     constant: ClassVar[frozenset[str]] = frozenset({"A", "f", "B"})
     entrywise: ClassVar[frozenset[str]] = frozenset({"g"})
 

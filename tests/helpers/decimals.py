@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from vibench.interfaces.problem import VariationalInequality
+from vibench import VariationalInequality
 
 DIGITS = 100
 ZERO = Decimal(10) ** -60

@@ -8,7 +8,7 @@ from vibench import Kind, Offline, Problem, ReducedSet, Reduction, Stop, no_free
 from vibench.model.galerkin import ReducedModel
 from vibench.offline.reduction import high_fidelity_sweep
 from vibench.reduction import LazyMaximum
-from vibench.stability.infsup import cone_basis
+from vibench.stability import cone_basis
 from vibench_strategies.cpg import CPG
 from vibench_strategies.online_supremizers import OnlineSupremizers
 

@@ -6,7 +6,6 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,9 +27,8 @@ class Wire(Problem):
     def __init__(self, nodes: Annotated[int, Ge(4), Le(500)] = 12, depth: float = 0.2) -> None:
         self.step, self.depth = 1.0 / (nodes + 1), depth
         ones = np.ones(nodes - 1)
-        self.stiffness = (
-            sp.csr_array(sp.diags_array([2.0 * np.ones(nodes), -ones, -ones], offsets=[0, 1, -1])) / self.step
-        )
+        bands = [2.0 * np.ones(nodes), -ones, -ones]
+        self.stiffness = sp.csr_array(sp.diags_array(bands, offsets=[0, 1, -1])) / self.step
         self.mass = sp.csr_array(sp.diags_array(np.full(nodes, self.step)))
         self.V = InnerProduct(self.stiffness + self.mass)
         self.W = InnerProduct(self.mass)
@@ -78,32 +76,6 @@ Segfaults = _changed("Segfaults", lambda vi: segfault())
 class Broken(Wire):
     def __init__(self) -> None:
         raise OSError("no wire in stock")
-
-
-class Hungry(Wire):
-    def __init__(self) -> None:
-        super().__init__()
-        self.meal = np.ones(2**36)
-
-
-Infeasible = _changed(
-    "Infeasible", lambda vi: replace(vi, B=sp.csr_array(sp.vstack([vi.B[:6], -vi.B[:6]])), g=np.full(12, -1.0))
-)
-
-
-class Chatty(Wire):
-    """Prints, writes past Python, forks, and is right all the same."""
-
-    forked = False
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        print("assembling", mu)
-        print("careful", file=sys.stderr)
-        os.write(1, b"written past Python\n")
-        if not self.forked:
-            self.forked = True
-            os.fork()  # two go on from here
-        return super().assemble(mu)
 
 
 class BadCone(DualStrategy):
@@ -154,12 +126,8 @@ def _answering(answer: Callable[[VariationalInequality], Any]) -> Callable[[Vari
 raises = _answering(lambda _: throw(RuntimeError("the solver\ngave in")))
 leaves = _answering(lambda _: sys.exit(3))
 dies = _answering(lambda _: os._exit(7))
-nothing = _answering(lambda _: None)
 gives_up = _answering(lambda _: QPSolution(None, None, "gave up"))
-not_a_number = _answering(lambda vi: QPSolution(np.full(len(vi.f), np.nan), np.zeros(len(vi.g)), "solved"))
 wrong = _answering(lambda vi: QPSolution(np.zeros(len(vi.f)), np.zeros(len(vi.g)), "solved"))
-wrong_length = _answering(lambda vi: QPSolution(np.zeros(len(vi.f) + 1), np.zeros(len(vi.g)), "solved"))
-hungry = _answering(lambda _: QPSolution(np.ones(2**36), np.ones(3), "solved"))
 
 
 def numpy_count(program: VariationalInequality, accuracy: float) -> QPSolution:

@@ -145,19 +145,15 @@ def run_command(
     return subprocess.CompletedProcess(list(arguments), process.wait(), out, err)
 
 
-def run_script(script: Path, *arguments: str, timeout: float = 600.0) -> subprocess.CompletedProcess[str]:
-    program = {"main": "script", "arguments": [str(script), *arguments], "path": [str(script.parent), *paths()]}
-    with _ended(ForkedCommand(program, script.parent)) as process:
-        out, err = process.communicate(timeout)
-    return subprocess.CompletedProcess([str(script), *arguments], process.wait(), out, err)
-
-
 def run_pytest(folder: Path, site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run `pytest ARGUMENTS` in a folder, with what is installed in another one."""
     script = folder / "run_tests.py"
     found = f"sys.path.insert(0, {str(site)!r})"
     script.write_text(f"import sys\n{found}\nimport pytest\nsys.exit(pytest.main({[*arguments]}))\n")
-    return run_script(script)
+    program = {"main": "script", "arguments": [str(script)], "path": [str(folder), *paths()]}
+    with _ended(ForkedCommand(program, folder)) as process:
+        out, err = process.communicate(600.0)
+    return subprocess.CompletedProcess([str(script)], process.wait(), out, err)
 
 
 @contextlib.contextmanager

@@ -24,9 +24,7 @@ def scattered(parts: list[tuple[Array, Array]], n: int) -> sp.csr_array:
 class Beam(AffineProblem):
     """A clamped beam of cubic Hermite elements over an obstacle, whose condition number grows as their number⁴."""
 
-    parameters = ParameterBox(
-        ("load", "bias", "depth"), np.array([1.0, -1.0, 4e-4]), np.array([4.0, 1.0, 2e-3]), ("1", "1", "1")
-    )
+    parameters = ParameterBox(("load", "bias", "depth"), np.array([1, -1, 4e-4]), np.array([4, 1, 2e-3]), ("1",) * 3)
 
     def __init__(self, elements: int) -> None:
         h, inner, n = 1.0 / elements, elements - 1, 2 * (elements - 1)
@@ -54,9 +52,7 @@ class Floating(AffineProblem):
     Where A varies its tension does, too.
     """
 
-    parameters = ParameterBox(
-        ("load", "bias", "tension"), np.array([1.0, -1.0, 0.5]), np.array([2.0, 1.0, 2.0]), ("1", "1", "1")
-    )
+    parameters = ParameterBox(("load", "bias", "tension"), np.array([1, -1, 0.5]), np.array([2, 1, 2.0]), ("1",) * 3)
 
     def __init__(self, springs: float, varying: bool, nodes: int = 14, contact: int = 5) -> None:
         off, rng = -np.ones(nodes - 1), np.random.default_rng(0)
@@ -82,7 +78,7 @@ class Truss(AffineProblem):
     """
 
     parameters = ParameterBox(
-        ("load", "bias", "stiffness"), np.array([0.5, -1.0, 0.1]), np.array([2.0, 1.0, 1.0]), ("1", "1", "1")
+        ("load", "bias", "stiffness"), np.array([0.5, -1, 0.1]), np.array([2, 1, 1.0]), ("1",) * 3
     )
 
     def __init__(self, bays: int) -> None:
@@ -125,9 +121,7 @@ class DoubleObstacle(AffineProblem):
     copies of some say the same again, one with an error of 1.5e-8. The mean is prescribed by a row and its opposite.
     """
 
-    parameters = ParameterBox(
-        ("load", "bias", "mean"), np.array([1.0, -3.0, -0.02]), np.array([3.0, 3.0, 0.02]), ("1", "1", "1")
-    )
+    parameters = ParameterBox(("load", "bias", "mean"), np.array([1, -3, -0.02]), np.array([3, 3, 0.02]), ("1",) * 3)
 
     def __init__(self, nodes: int) -> None:
         h, rng = 1.0 / (nodes + 1), np.random.default_rng(0)

@@ -53,7 +53,6 @@ def replaced(owner: Any, name: str) -> None:
 
 
 def changed(name: str, change: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """A function that returns another one with a changed member."""
     return lambda one: replace(one, **{name: change(getattr(one, name))})
 
 

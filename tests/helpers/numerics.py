@@ -60,7 +60,6 @@ class Tied(Varying):
 
 
 def doubled_areas(points: Array, triangles: Array) -> Array:
-    """Signed areas of triangles, doubled."""
     a, b, c = (points[:, corner] for corner in triangles)
     return np.asarray((b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0])
 

@@ -11,8 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from samples import toml
 
-from vibench.highfidelity.active_set import solve_high_fidelity
-from vibench.interfaces.problem import VariationalInequality
+from vibench import VariationalInequality, solve_high_fidelity
 
 SIZE = 12
 LOADS, DEPTH = [4.0, 6.0, 8.0], 0.2

@@ -4,8 +4,6 @@ Every function takes the offline phase and returns the query at a parameter: coe
 `tests/benchmarks/competitors.py` measures them.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import replace

@@ -65,7 +65,6 @@ def started(command: list[str], folder: Path, plugins: Path) -> Iterator[subproc
 
 
 def rows(folder: Path, table: str = "cells") -> list[dict[str, Any]]:
-    """The rows of a results file, in the order they were written."""
     db = sqlite3.connect(folder / FILE)
     db.row_factory = sqlite3.Row
     try:
@@ -160,7 +159,6 @@ def numbers(folder: Path) -> dict[str, pd.DataFrame]:
 
 
 def without_seconds(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row without seconds, memory, and what follows from them."""
     return {name: row[name] for name in row if not name.endswith((*MEASURED, "timing_rounds", "timing_reason"))}
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vibench.interfaces.strategies import Kind
+from vibench import Kind
 from vibench.results.break_even import break_even_rows
 from vibench.results.database import ResultsDatabase
 from vibench.results.schema import STORED, Column, SqlType

@@ -12,7 +12,7 @@ import fake_plugins
 import pandas as pd
 
 import vibench
-from vibench.interfaces.strategies import Stop
+from vibench import Stop
 from vibench.plugins.plugin import Plugin
 from vibench.results.schema import STORED
 from vibench.stages.artefacts import Artefact, Store
@@ -85,7 +85,6 @@ def write_study(folder: Path, content: Mapping[str, Any] = STUDY, name: str = "s
 
 
 def filled(table: str) -> dict[str, Any]:
-    """A row in which every column has a value."""
     samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3, "BLOB": b""}
     return {name: samples[column.kind.split()[0]] for name, column in STORED[table].items()}
 
@@ -116,18 +115,12 @@ def query_rows(cell: str = "c1", count: int = 2, **columns: Any) -> list[dict[st
 
 
 FAKES: Mapping[str, Mapping[str, str]] = {
-    "vibench.problems": {
-        "wire": "Wire", "wire-raises": "Raises", "wire-broken": "Broken", "wire-hungry": "Hungry",
-        "wire-sleeps": "Sleeps", "wire-exits": "Exits", "wire-segfaults": "Segfaults", "wire-infeasible": "Infeasible",
-        "wire-chatty": "Chatty",
-    },
-    "vibench.dual_strategies": {
-        "cone-needs": "NeedyCone", "cone-raises": "RaisingCone", "cone-waits": "WaitingCone",
-    },
+    "vibench.problems": {"wire": "Wire", "wire-raises": "Raises", "wire-broken": "Broken", "wire-sleeps": "Sleeps"},
+    "vibench.dual_strategies": {"cone-needs": "NeedyCone", "cone-raises": "RaisingCone", "cone-waits": "WaitingCone"},
     "vibench.primal_strategies": {"enrichment-counts": "CountingEnrichment"},
-    "vibench.qp_solvers": {"nan": "not_a_number", "counts": "numpy_count"} | {name.replace("_", "-"): name for name in (
-        "careful", "raises", "nothing", "gives_up", "wrong", "wrong_length", "dies", "leaves", "hangs", "segfaults",
-        "dies_sometimes", "dies_once", "hungry", "chatty",
+    "vibench.qp_solvers": {"counts": "numpy_count"} | {name.replace("_", "-"): name for name in (
+        "careful", "raises", "gives_up", "wrong", "dies", "leaves", "hangs", "segfaults", "dies_sometimes", "dies_once",
+        "chatty",
     )},
 }  # fmt: skip
 """What the third-party package registers: group → name → member of `fake_plugins`."""

@@ -25,16 +25,9 @@ class Transformed(Problem):
     """
 
     def __init__(
-        self,
-        base: str,
-        options: dict[str, Any] | None = None,
-        length: int = 0,
-        force: int = 0,
-        rows: float = 0.0,
-        unknowns: float = 0.0,
-        far: float = 0.0,
-        seed: int = 0,
-    ) -> None:
+        self, base: str, options: dict[str, Any] | None = None, length: int = 0, force: int = 0, rows: float = 0.0,
+        unknowns: float = 0.0, far: float = 0.0, seed: int = 0,
+    ) -> None:  # fmt: skip
         self._base = problem = BASES[base](**(options or {}))
         rng, n, m = np.random.default_rng(seed), problem.V.dim, problem.W.dim
         self.parameters, self.constant, self.entrywise = problem.parameters, problem.constant, problem.entrywise

@@ -13,7 +13,6 @@ GAP = 2.0 + 0.15 * (np.arange(10) - 3.7) ** 2
 
 
 def share(mu: Array) -> float:
-    """The factor of the fifth row, zero in half of the box."""
     return max(0.0, float(mu[1]))
 
 

@@ -1,5 +1,3 @@
-"""The benchmarks time whatever is registered and keep what it reached; two of their files are compared by both."""
-
 import importlib.util
 import json
 import math

@@ -1,5 +1,3 @@
-"""The map of the code in CONTRIBUTING is that of the code, whose core imports no plugin and names none."""
-
 import ast
 import importlib
 import importlib.metadata

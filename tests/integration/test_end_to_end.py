@@ -1,5 +1,3 @@
-"""The whole matrix through the command line, judged by the invariants that every row must keep."""
-
 from pathlib import Path
 
 import numpy as np

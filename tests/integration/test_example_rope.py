@@ -1,5 +1,3 @@
-"""The example package: installed as a third party's, found by its entry points, run beside the built-in ones."""
-
 import shutil
 import subprocess
 import sys
@@ -14,7 +12,7 @@ from running import Vibench
 from samples import ROUNDS, write_study
 from sources import SOURCES, mentions
 
-from vibench.interfaces.problem import MEMBERS
+from vibench import MEMBERS
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 

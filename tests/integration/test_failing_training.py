@@ -55,7 +55,7 @@ class Lost(vibench.AdaptiveSampling):
         raise KeyError("lost")
 
 
-def test_failed_solutions_are_offline_time_and_samplings_have_own_faults(
+def test_failed_solutions_are_offline_time_and_samplings_have_faults(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cell, clock, assemble = expand(study({"name": "own", "on_failure": "skip"}))[0], [0.0], Tangled.assemble
@@ -92,9 +92,8 @@ def test_no_more_than_a_tenth_is_skipped_and_such_cells_are_others() -> None:
         study("own", validation={"name": "sobol", "size": 4, "on_failure": "skip"})
     with pytest.raises(RequestError, match="chooses training parameters by what solutions know; it has none to skip"):
         study({"name": "greedy", "candidates": 10, "tolerance": 0.1, "on_failure": "skip"})
-    plain, skipping = (
-        expand(study({"name": "own", "on_failure": choice}, problem=["obstacle"]))[0] for choice in ("stop", "skip")
-    )
+    own = ({"name": "own", "on_failure": choice} for choice in ("stop", "skip"))
+    plain, skipping = (expand(study(one, problem=["obstacle"]))[0] for one in own)
     assert plain.key != skipping.key
     assert plain.key == expand(study("own", problem=["obstacle"]))[0].key
     for cell in (plain, skipping):

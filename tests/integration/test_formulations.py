@@ -1,5 +1,3 @@
-"""Formulations in studies: the mixed one as a plugin gives its numbers, and misbehaviour costs its own rows."""
-
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +9,7 @@ from formulations import Coarse, Nearest, Program
 
 from vibench import RequestError, Run, Study, open_run, run
 from vibench.results.consistency import violations
-from vibench.study.cells import Cell
-from vibench.study.matrix import expand, study_of_cell
+from vibench.study.matrix import expand
 
 REASONS = {"raises": ("error", "ArithmeticError: no pivot"), "dies": ("crashed", "died with signal SIGKILL")}
 """What `Misbehaves` does at forces above 6, those of queries 0 and 2, and what becomes of it."""
@@ -137,12 +134,3 @@ def test_formulations_are_timed_with_all_of_it_and_answer_again(found: Run) -> N
         nearest.reduced  # noqa: B018
     with pytest.raises(RequestError, match="the formulation Nearest uses no QP solver"):
         nearest.solve([5.0], solver="piqp")
-
-
-@pytest.mark.long
-def test_the_study_of_a_cell_is_the_same_cell_and_report_and_figures_take_it(found: Run, tmp_path: Path) -> None:
-    for row in found.table("cells").to_dict("records"):
-        cell = Cell.from_definition(row["definition"])
-        assert [one.key for one in expand(study_of_cell(cell, "again"))] == [row["cell"]]
-    assert "Nearest" in found.report(tmp_path / "report.html", figures=False).read_text()
-    assert found.write_figures(tmp_path / "figures", ["svg"])

@@ -1,5 +1,3 @@
-"""Studies on packs give the numbers of problems; packs are found beside the study, moved ones where the user says."""
-
 import shutil
 from pathlib import Path
 from typing import Any
@@ -111,9 +109,8 @@ def test_results_name_the_pack_beside_the_study_or_where_it_was_moved(made: Path
     assert "piqp (recorded)" in out
     assert main("export", run, key(made), "model.npz", "--at", at)[0] == 0
     assert main("export", run, "set", "--at", at)[0] == 0
-    succeeded(
-        main("run", f"{run}/{FILE}", "--cell", key(made), "--at", at, "--out", "again", "--jobs", "1", "--no-figures")
-    )
+    again = ("--out", "again", "--jobs", "1", "--no-figures")
+    succeeded(main("run", f"{run}/{FILE}", "--cell", key(made), "--at", at, *again))
     (row,) = rows(Path("again"))
     assert (row["cell"], row["status"], row["problem_options"]) == (key(made), "ok", '{"path": "packs/cable"}')
     model = library.open_run(run, at={"packs/cable": "../new/rope"}).model(key(made))
@@ -141,7 +138,6 @@ def test_two_packs_of_one_name_elsewhere_are_refused(main: Main, tmp_path: Path)
     problems = [{"name": "pack", "options": {"path": f"../{name}/cable"}} for name in ("a", "b")]
     (tmp_path / "study" / "study.toml").write_text(toml(STUDY | {"problem": problems}))
     refused(main("run", str(tmp_path / "study" / "study.toml"), "--dry-run"), "files of one name in different folders")
-    (tmp_path / "study.toml").write_text(
-        toml(STUDY | {"problem": [{"name": "pack", "options": {"path": f"{name}/cable"}} for name in ("a", "b")]})
-    )
+    problems = [{"name": "pack", "options": {"path": f"{name}/cable"}} for name in ("a", "b")]
+    (tmp_path / "study.toml").write_text(toml(STUDY | {"problem": problems}))
     assert succeeded(main("run", str(tmp_path / "study.toml"), "--dry-run")).splitlines()[-1] == "2 cells"

@@ -1,12 +1,5 @@
-"""Running a matrix through the command line."""
-
-import importlib.util
-import os
 import re
 import shutil
-import subprocess
-import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -17,7 +10,6 @@ from samples import wire_study, write_study
 import vibench.execution.run  # noqa: F401  lists the classes of all stages
 from vibench.results.schema import TABLES
 from vibench.results.sqlite import FILE
-from vibench.stages.artefacts import Store, encoded
 from vibench.study.parameter_sets import CHUNKS
 
 SOLVERS = ["piqp", "careful", "gives-up"]
@@ -178,36 +170,6 @@ def test_plugins_whose_requirements_are_missing_are_unavailable(vibench: Vibench
     assert {row["reason"] for row in rows(folder / "runs" / "wire")} == {reason}
 
 
-@pytest.mark.long
-def test_edits_beside_numbers_run_none(vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures, help texts, the report and the tables may change: the run is complete, and its models open."""
-    package, edited_core = Path(importlib.util.find_spec("vibench").submodule_search_locations[0]), tmp_path / "core"
-    # First on the path the copy takes the place of what is installed; its bytecode would take seconds to make.
-    shutil.copytree(package, edited_core / "vibench")
-    monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
-    rope = {"name": "radial-obstacle", "options": {"resolution": 200}}
-    study = write_study(tmp_path, wire_study(problem=[rope]))
-
-    def edited(*commands: tuple[str, ...]) -> str:
-        """What commands print, one after the other, in one new interpreter."""
-        program = f"from vibench.cli.main import app\nfor c in {commands}: app(args=[*c], standalone_mode=False)"
-        environment = os.environ | {"PYTHONPATH": str(edited_core)}
-        done = subprocess.run(
-            [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
-        assert (done.returncode, done.stderr) == (0, "")
-        return done.stdout
-
-    run = ("run", study, "--jobs", "1", "--no-figures")
-    assert "1 cells, 1 to run" in vibench(tmp_path, *run).stdout  # with what is installed, where nothing is edited
-    for module in ("report/html.py", "report/figures/style.py", "cli/main.py", "results/read.py", "testing/sample.py"):
-        with (edited_core / "vibench" / module).open("a", encoding="utf-8") as source:
-            source.write("\n# edited\n")
-    printed = edited(run, ("export", "wire", "programs"))
-    assert "1 cells, 0 to run, 0 stages" in printed
-    assert "3 programs" in printed  # of the model as it was
-
-
 def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) -> None:
     write_study(tmp_path, wire_study(
         problem=[{"name": "wire", "label": "long", "options": {"nodes": 40}}], solvers=["piqp", "osqp", "gives-up"],
@@ -218,38 +180,6 @@ def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) 
         done = vibench(tmp_path, "run", "study.toml", "--jobs", jobs, "--out", jobs, "--fresh")
         assert done.returncode == 0, done.stderr
     assert_same_numbers(tmp_path / "1", tmp_path / "2")
-
-
-@pytest.mark.long
-def test_artefacts_are_shared_on_one_machine(vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
-    # high-fidelity solutions of both sets, and their constants at one; pictures; POD, cone, enrichment; assembly, exact
-    # solutions; constraints twice; five inf-sup constants
-    made = 3 * CHUNKS + 13
-    one = wire_study(solvers=["piqp", "careful"])
-    two = one | {"name": "other", "accuracy": 1e-6}
-    write_study(tmp_path, one, "one.toml")
-    write_study(tmp_path, two, "two.toml")
-
-    def stages(*options: str) -> int:
-        done = vibench(tmp_path, "run", *options, "--jobs", "1")
-        assert (done.returncode, done.stderr) == (0, "")
-        return int(re.search(r"to run, (\d+) stages", done.stdout)[1])
-
-    assert stages("one.toml") == made + 2
-    assert stages("two.toml") == 2  # only the queries of its two cells
-    assert stages("one.toml", "--out", "again") == 2
-    assert stages("one.toml", "--out", "anew", "--fresh") == made + 2
-    assert_same_numbers(tmp_path / "again", tmp_path / "anew")
-    # wall seconds are those of the stages alone: how often short ones are repeated depends on what they take
-    again, anew = (rows(tmp_path / folder)[0]["offline_wall_s"] for folder in ("again", "anew"))
-    assert again == rows(tmp_path / "runs" / "wire")[0]["offline_wall_s"] != anew  # measured only where made anew
-    store = Store(tmp_path / "cache" / "artefacts")
-    for path in (tmp_path / "cache" / "artefacts").glob("*.artefact"):
-        key = path.name.removesuffix(".artefact")
-        path.write_bytes(encoded(key, replace(store.get(key), machine="elsewhere")))
-    assert stages("one.toml", "--out", "here") == made + 2
-    assert rows(tmp_path / "here")[0]["machine"] == rows(tmp_path / "again")[0]["machine"]
 
 
 def test_clean_shows_and_frees_artefacts(vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from running import Register
 from samples import SampleStore, carry_out, program_queries
 from transformed import Transformed
 
-from vibench.interfaces.strategies import Stop
+from vibench import Stop
 from vibench.plugins.plugin import Plugin
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellRows

@@ -6,9 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from vibench import DualStrategy, HighFidelitySolver, Offline, ReducedSet, Stop
+from vibench import DualStrategy, HighFidelitySolver, Offline, ReducedSet, Stop, pod
 from vibench.reduction.cones import orthogonality
-from vibench.reduction.pod import pod
 from vibench.stability.infsup import cone_basis, inf_sup_full, inf_sup_on, nodal_cone
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG

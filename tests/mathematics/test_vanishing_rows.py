@@ -15,8 +15,8 @@ from vibench import Contact, HighFidelitySolver, NumericalError, VariationalIneq
 from vibench.interfaces.absent_rows import settled_bounds, zero_rows
 from vibench.model.affine import Evaluation, affine_decomposition
 from vibench.offline.assemblies import Assemblies
+from vibench.qp import verify
 from vibench.qp.solve import installed_solvers, solve_qp
-from vibench.qp.verification import verify
 from vibench.stability.infsup import inf_sup_full, nodal_cone
 
 

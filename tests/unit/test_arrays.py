@@ -1,5 +1,3 @@
-"""Products of sparse and dense matrices, whatever their rows."""
-
 import numpy as np
 import pytest
 import scipy.sparse as sp

@@ -1,5 +1,3 @@
-"""What problems share around scikit-fem: Gram matrices, masses, constraints, Dirichlet data."""
-
 from functools import partial
 
 import numpy as np

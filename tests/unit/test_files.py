@@ -1,11 +1,9 @@
-"""Lock files: one holder, or several that share, and a refusal that names it; what killed processes leave."""
-
 import os
 from pathlib import Path
 
 import pytest
 
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.files import locked, scratch
 
 

@@ -1,7 +1,5 @@
 """Processes that end with their parent, however it dies: twelve kinds of death, and four of processes."""
 
-from __future__ import annotations
-
 import contextlib
 import subprocess
 import sys

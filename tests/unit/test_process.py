@@ -1,5 +1,3 @@
-"""What the code of plugins changes in its process is put back, or is known not to be back."""
-
 import builtins
 import os
 import resource

@@ -1,5 +1,3 @@
-"""Where numbers come from: machine, versions and the code."""
-
 import importlib.metadata
 import os
 import platform

@@ -1,6 +1,5 @@
-"""What authors of plugins and users of the library import: from `vibench` or a named submodule of it, and lazily."""
-
 import inspect
+import os
 import re
 import subprocess
 import sys
@@ -68,3 +67,40 @@ def test_each_part_of_vibench_loads_nothing_that_it_does_not_need() -> None:
     assert loaded(code) & {"qpsolvers", "matplotlib", "skfem"} == set()
     code = "import vibench.execution.worker, vibench.stages.cell_queries, vibench.stages.pictures"
     assert loaded(code) & {"matplotlib", "pandas", "rich", "typer"} == set()
+
+
+LIBRARIES = HEAVY - {"typer"} | {"vibench_problems"}
+
+
+def imported(command: str, *arguments: str, **environment: str) -> tuple[set[str], str]:
+    """Top-level packages that a process of the installed command imports, and what it prints."""
+    line = [sys.executable, "-X", "importtime", command, *arguments]
+    done = subprocess.run(line, env=os.environ | environment, capture_output=True, text=True, check=True)
+    lines = [line for line in done.stderr.splitlines() if line.startswith("import time:")]
+    return {line.rsplit("|", 1)[1].strip().split(".")[0] for line in lines}, done.stdout
+
+
+def test_help_lists_and_completion_import_no_library_they_do_not_need(command: str) -> None:
+    """All commands are defined before any prints its help: one stands for the others."""
+    for name in ("", "export"):
+        packages, printed = imported(command, *name.split(), "--help")
+        assert printed.startswith(f"Usage: vibench {name}".rstrip())
+        assert "vibench" in packages
+        assert packages & LIBRARIES == set()
+    packages, printed = imported(command, "list")
+    assert "obstacle" in printed
+    assert packages & {"scipy", "pandas", "skfem", "qpsolvers", "matplotlib"} == set()
+    packages, printed = imported(command, "list", "problems")
+    assert "resolution: " in printed
+    assert "skfem" in packages
+    assert packages & {"pandas", "matplotlib", "qpsolvers"} == set()
+    for line, word in (
+        ("r", "replay"), ("run --dual ", "mcpg"), ("show quick --table ", "histories"),
+        ("check obstacle --option ", "resolution="),
+    ):  # fmt: skip
+        words = {"COMP_WORDS": f"vibench {line}", "COMP_CWORD": str(line.count(" ") + 1)}
+        packages, printed = imported(command, _VIBENCH_COMPLETE="complete_bash", **words)
+        assert word in printed.split()
+        assert "vibench" in packages
+        package = {"vibench_problems"} if "--option" in line else set()  # the package that holds the module
+        assert packages & (LIBRARIES - {"pydantic"}) == package  # typer itself checks the words before with pydantic

@@ -97,9 +97,7 @@ def rows() -> pd.DataFrame:
     return pd.read_csv(ROOT / "docs" / "reproduction.csv", dtype=str, keep_default_na=False)
 
 
-def test_the_page_has_every_row_and_figure_and_their_counts_and_reasons(
-    rows: pd.DataFrame, reproduction: ModuleType
-) -> None:
+def test_the_page_has_every_row_figure_count_and_reason(rows: pd.DataFrame, reproduction: ModuleType) -> None:
     page, named = (ROOT / "docs" / "reproduction.md").read_text(encoding="utf-8"), list(rows["claim"])
     cells = [f"{table}, {column}: {line}" for table, columns in TABLES.items() for column in columns for line in LINES]
     assert [cell for cell in cells if named.count(cell) != 1] == []

@@ -18,9 +18,8 @@ from PIL import Image
 from running import Changed
 
 from vibench.execution.recorded_cell import recorded_study
-from vibench.report import html, site
+from vibench.report import Sheet, html, site, styled
 from vibench.report.citation import Citation
-from vibench.report.figures.style import Sheet, styled
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 from vibench.study.matrix import expand
@@ -38,7 +37,6 @@ LINK = re.compile(r"\]\(([^)\s#]+)(?:#[^)]*)?\)")
 
 
 def linked(page: Path) -> set[Path]:
-    """Files of the repository that a page shows or links."""
     targets = LINK.findall(page.read_text(encoding="utf-8"))
     return {(page.parent / target).resolve() for target in targets if "://" not in target}
 
@@ -78,7 +76,6 @@ def test_one_command_makes_every_page_that_the_overview_lists() -> None:
 
 
 def rows_of(study: str, **equal: str) -> Iterator[dict[str, str]]:
-    """Cells of a committed study, with these texts in these columns."""
     with (RESULTS / study / "cells.csv").open(encoding="utf-8", newline="") as file:
         yield from (row for row in csv.DictReader(file) if all(row[name] == text for name, text in equal.items()))
 

@@ -1,12 +1,9 @@
-"""Text from others: printable, in one line, of bounded length, and the same text where it was all that before."""
-
 import json
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from odd_plugins import UnreadableError
 
 from vibench.benchmarks.comparison import read_benchmarks
 from vibench.errors import RequestError, in_a_line
@@ -45,6 +42,11 @@ def test_what_is_not_printable_is_shown_as_an_escape() -> None:
 @given(st.recursive(st.text() | st.integers() | st.none(), lambda part: st.dictionaries(st.text(), part, max_size=3)))
 def test_json_has_the_same_content_afterwards(content: object) -> None:
     assert json.loads(printable(json.dumps(content, ensure_ascii=False))) == content
+
+
+class UnreadableError(Exception):
+    def __str__(self) -> str:
+        raise ValueError("not to be read")
 
 
 def test_long_texts_and_messages_of_exceptions_are_cut_to_one_line() -> None:

@@ -1,5 +1,3 @@
-"""Seconds: which clock, how many repeats, one thread, and how disturbed the machine is."""
-
 import itertools
 import os
 import subprocess

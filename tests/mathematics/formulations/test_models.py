@@ -41,7 +41,6 @@ class Supplied(PrimalStrategy):
 
 @pytest.fixture(scope="module")
 def processes() -> Model:
-    """Gaussian processes of the string."""
     pytest.importorskip("sklearn")
     return STRING.with_formulation(Regression()).model
 
@@ -256,7 +255,6 @@ LENGTH = 1e4
 
 @pytest.fixture(scope="module")
 def discs() -> list[Reduction]:
-    """Hertz contact in its own units and in others."""
     made = []
     for units in ({}, {"length": 4, "force": -3}):
         of = Transformed("hertz", {"resolution": 300}, **units)

@@ -1,7 +1,5 @@
 """Formulations beside plain versions of them that are written from their papers, on a small Hertz contact."""
 
-from __future__ import annotations
-
 import numpy as np
 import plain_formulations as plain
 import pytest
@@ -29,7 +27,7 @@ def discs() -> Reduction:
     ("regression", {}, plain.gaussian_regression, 1e-3),
     ("regression", {"kind": "radial"}, plain.radial_regression, 1e-6),
 ])  # fmt: skip
-def test_answers_are_those_of_the_plain_version(
+def test_answers_are_plain_ones(
     discs: Reduction, name: str, options: dict[str, str], plainly: object, tolerance: float
 ) -> None:
     model, query = discs.with_formulation(create("formulation", name, options)).model, plainly(discs)
@@ -44,9 +42,7 @@ def test_answers_are_those_of_the_plain_version(
 
 
 @pytest.mark.parametrize("name", ["mixed", "penalty", "proximal", "sparse-dictionary", "local", "regression"])
-def test_what_is_timed_passes_no_border_of_public_callables(
-    discs: Reduction, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_timed_passes_no_public_border(discs: Reduction, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its arguments were checked where they came from: a check takes as long as a query of `regression`."""
     model = discs.with_formulation(create("formulation", name)).model
     mu, settings = discs.problem.validation_set(1, 0)[0], QuerySettings(ACCURACY, SOLVE)

@@ -11,8 +11,7 @@ import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vibench.errors import NumericalError
-from vibench.highfidelity.active_set import HighFidelitySolver, solve_high_fidelity
+from vibench import HighFidelitySolver, NumericalError, solve_high_fidelity
 from vibench.model.affine import Evaluation, affine_decomposition
 from vibench.offline.compiled import compiled_contact
 from vibench.reduction.supremizers import constraint_classes, proportionality

@@ -29,9 +29,7 @@ def test_the_mesh_is_a_triangulation_of_the_square_that_fits_the_disc(nodes: int
     assert aspect_ratios(mesh.p, mesh.t).max() < 2.0
 
 
-def test_a_mesh_that_is_triangulated_once_is_the_one_triangulated_at_every_sweep(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_mesh_triangulated_once_is_the_one_triangulated_at_every_sweep(monkeypatch: pytest.MonkeyPatch) -> None:
     once = disc_in_square(300, 0.2)
     monkeypatch.setattr(disc_mesh, "_are_delaunay", lambda *_: False)
     other = disc_in_square(300, 0.2)

@@ -63,9 +63,7 @@ SENSORS = {
 
 
 @pytest.mark.parametrize(("sensor", "place"), SENSORS.items(), ids=str)
-def test_a_deflection_is_that_of_the_node_nearest_to_its_place(
-    sensor: tuple[str, str], place: tuple[float, float]
-) -> None:
+def test_a_deflection_is_that_of_the_nearest_node(sensor: tuple[str, str], place: tuple[float, float]) -> None:
     problem = create("problem", sensor[0], {"resolution": "medium"})
     nodes, mu = problem.mesh.p[:, problem.free], problem.parameters.lower
     x, y = (value(problem, sensor[1], mu, coordinates, np.zeros(problem.W.dim)) for coordinates in nodes)

@@ -12,8 +12,8 @@ import pytest
 from matplotlib.axes import Axes
 from running import Changed, execute
 
-from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.report.figures.data import ProblemTables, problem_tables
+from vibench import HighFidelitySolver
+from vibench.report import ProblemTables, problem_tables
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 from vibench_problems.hertz import Hertz
@@ -64,7 +64,6 @@ def line_called(axes: Axes, label: str) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def both(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A results file with the models of the paper for both problems."""
     path = Path(shutil.copy(quick_run / FILE, tmp_path_factory.mktemp("published")))
     execute(path.parent, *OBSTACLE, *HERTZ)
     return path

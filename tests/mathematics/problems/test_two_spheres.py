@@ -30,11 +30,7 @@ def spheres(cells: int, extent: float) -> tuple[TwoSpheres, HighFidelitySolver]:
     return one, HighFidelitySolver(one)
 
 
-@given(
-    st.lists(st.floats(0.05, 1.0), min_size=1, max_size=6),
-    st.lists(st.floats(0.05, 1.0), min_size=1, max_size=6),
-    st.floats(1.0, 2.0),
-)
+@given(*[st.lists(st.floats(0.05, 1.0), min_size=1, max_size=6)] * 2, st.floats(1.0, 2.0))
 def test_integrals_of_hats_are_those_of_quadrature(first: list[float], second: list[float], longer: float) -> None:
     cuts, nodes = (np.concatenate([[0.0], np.cumsum(each)]) for each in (first, second))
     nodes *= longer * cuts[-1] / nodes[-1]

@@ -12,24 +12,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numerics import Varying
 
-from vibench import (
-    Array,
-    HighFidelitySolver,
-    Kind,
-    NumericalError,
-    Offline,
-    ReducedSet,
-    Stop,
-    check_enrichment,
-    no_free,
-)
+from vibench import HighFidelitySolver, Kind, NumericalError, Offline, ReducedSet, Stop, check_enrichment, no_free
+from vibench.arrays import Array
 from vibench.errors import RequestError
-from vibench.linalg.inner_product import orthonormal_range, project_out, singular_values
-from vibench.reduction.cones import LazyMaximum
+from vibench.linalg import orthonormal_range, project_out, singular_values
+from vibench.reduction import LazyMaximum
 from vibench.reduction.nested import NestedStrategy, grow_through
 from vibench.reduction.pod import pod
 from vibench.reduction.supremizers import supremizers
-from vibench.stability.infsup import cone_basis, inf_sup_full, inf_sup_on
+from vibench.stability import cone_basis, inf_sup_full, inf_sup_on
 from vibench.testing import check
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
@@ -86,7 +77,6 @@ SIZES = st.integers(12, 40), st.integers(3, 9), st.integers(1, 6), st.integers(1
 
 
 def drawn(n: int, m: int, count: int, modes: int, generators: int) -> Offline:
-    """A small problem of which hypothesis draws the dimensions."""
     return offline(Varying(n, m, count), count, modes, min(generators, count))
 
 
@@ -186,7 +176,7 @@ ON_BETA = pytest.mark.parametrize("strategy", [InfSupGreedy(), OfflinePGA(stop="
 @ON_BETA
 @pytest.mark.parametrize("rho", [0.2, 0.9])
 @BOTH
-def test_the_share_is_kept_at_every_training_parameter_and_not_with_a_vector_less(
+def test_the_share_is_kept_at_every_parameter_by_no_fewer(
     request, setting: str, strategy: NestedStrategy, rho: float
 ) -> None:
     data: Offline = request.getfixturevalue(setting)

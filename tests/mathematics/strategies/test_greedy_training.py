@@ -36,7 +36,6 @@ class Distance(Trainer):
 
 
 def apart(mus: Array, solved: list[Array]) -> Array:
-    """Distances of parameters (P×d) from the nearest of some."""
     return np.linalg.norm(np.asarray(mus)[:, None] - np.array(solved), axis=2).min(axis=1)
 
 

@@ -34,12 +34,7 @@ def test_a_posterior_in_one_command_which_continues_what_was_stopped(
 ) -> None:
     code, out, err = main(*COMMAND, *SYNTHETIC)
     assert (code, err) == (0, ""), err
-    for words in (
-        "height",
-        "curvature",
-        "exact: every decision is that of the high-fidelity model",
-        "seconds: ",
-    ):
+    for words in ("height", "curvature", "exact: every decision is that of the high-fidelity model", "seconds: "):
         assert words in out
     folder = Path("calibrations/data")
     assert {file.name for file in folder.iterdir()} == {"chain.npz", "posterior.csv", "posterior.nc", "posterior.png"}
@@ -110,11 +105,7 @@ RIGHT: dict[str, Any] = {"value": -0.07, "noise": 0.001}
         ({OUTER: RIGHT}, "covariance = [[1.0]]", "with a covariance the sensors have no noise of their own"),
         ({OUTER: {"value": 1.0}}, "covariance = [[-1.0]]", "the covariance of the noise is not positive definite"),
         ({OUTER: RIGHT}, "[prior]\ndepth = { mean = 0.1, sd = 0.1 }", "no parameter is called 'depth'"),
-        (
-            {OUTER: RIGHT},
-            "[prior]\nheight = { mean = 0.1, sd = 0.0 }",
-            "prior.height.sd: Input should be greater",
-        ),
+        ({OUTER: RIGHT}, "[prior]\nheight = { mean = 0.1, sd = 0.0 }", "prior.height.sd: Input should be greater"),
         ({OUTER: RIGHT}, "x = ", "not valid TOML"),
     ],
 )

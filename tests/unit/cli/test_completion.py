@@ -1,5 +1,3 @@
-"""Words that a shell completes, and the examples of `--help`."""
-
 import os
 import shlex
 import subprocess

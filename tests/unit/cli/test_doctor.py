@@ -1,5 +1,3 @@
-"""What the doctor says, and when something counts as broken."""
-
 import importlib.metadata
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,14 +6,12 @@ from unittest.mock import Mock
 import pytest
 from running import Main, Register, succeeded
 
-from vibench import provenance
+from vibench import RequestError, Status, provenance
 from vibench.cli import doctor
 from vibench.cli.doctor import Diagnosis, Health
-from vibench.errors import RequestError
 from vibench.execution.isolated import Trial
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
-from vibench.qp.status import Status
 from vibench.qp.verification import Residuals
 from vibench.stages.artefacts import Store, default_folder
 from vibench.timing import NO_TIME, Seconds, Stopwatch

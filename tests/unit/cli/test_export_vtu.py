@@ -1,5 +1,3 @@
-"""The command that exports a solution for ParaView."""
-
 from pathlib import Path
 
 import numpy as np

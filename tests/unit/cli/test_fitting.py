@@ -1,5 +1,3 @@
-"""Tables fit the terminal, and what is left out is named; text from others acts on nothing, and lines stay lines."""
-
 import contextlib
 import io
 import re
@@ -70,6 +68,8 @@ def test_rows_share_the_room_and_titles_have_what_they_share(monkeypatch: pytest
     frame = pd.DataFrame({name: [1.23456, 2.34567] for name in ("alpha", "bravo", "charlie")})
     lines = printed(frame.assign(bravo=[1, 2], charlie=[3, 4]), 13, ["charlie", "alpha", "bravo"])
     assert lines[1].split() == ["alpha", "charlie"]
+    short = frame[["alpha", "bravo"]].set_axis(["a", "b"], axis=1)  # which two columns of four characters fill
+    assert [printed(short, width)[1].split() for width in (8, 9)] == [["a"], ["a", "b"]]
     assert "bravo" in " ".join(lines[5:])
     words = " ".join(["alpha", "bravo", "charlie"] * 9)
     frame = pd.DataFrame({"name": ["a" * 33, "b"], "value": [words, "2"], "unit": ["1", "s"]})
@@ -172,7 +172,6 @@ def test_a_cell_has_all_columns_or_is_refused(main: Main, quick_run: Path, monke
 
 
 def lines_of(action: Callable[[], object]) -> list[str]:
-    """The lines that an action prints."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
         action()
     return out.getvalue().split("\n")

@@ -1,5 +1,3 @@
-"""The command line: what is wrong with a request is one line and exit code 2, and nothing is started."""
-
 import csv
 import importlib.metadata
 import io
@@ -13,12 +11,12 @@ import pytest
 from running import Main, Register, refused, succeeded
 from samples import STUDY, changed, write_study
 
+from vibench import Status
 from vibench.cli.main import explained_words, renamed
 from vibench.plugins import kinds, registry
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import find, registered
 from vibench.qp.settings import SETTINGS
-from vibench.qp.status import Status
 from vibench.report.differences import ChangeKind
 from vibench.results.break_even import Meaning
 from vibench.results.ranking import added_columns
@@ -142,9 +140,7 @@ def test_a_problem_alone_is_run_with_the_usual_choices(main: Main, tmp_path: Pat
 
 
 def test_a_strategy_in_a_file_is_a_row_of_a_run(main: Main, tmp_path: Path) -> None:
-    (tmp_path / "cone.py").write_text(
-        "from vibench_strategies.mcpg import ModifiedCPG\n\nclass Mine(ModifiedCPG):\n    pass\n"
-    )
+    (tmp_path / "cone.py").write_text("import vibench_strategies.mcpg as m\nclass Mine(m.ModifiedCPG):\n    pass\n")
     duals = ["--dual", "mcpg", "--dual", f"{tmp_path}/cone.py:Mine"]
     out = succeeded(main("run", "--problem", "obstacle", *duals, "--dry-run"))
     assert (out.count("obstacle · mcpg · "), out.count("obstacle · Mine · ")) == (8, 8)

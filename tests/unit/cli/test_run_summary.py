@@ -1,5 +1,3 @@
-"""The end of a run: reasons are grouped, cells are named wholly, and what to do next are commands."""
-
 import shlex
 from pathlib import Path
 from typing import Any
@@ -70,7 +68,6 @@ def test_every_reason_has_a_line_and_what_to_do_next_is_a_command(capsys: Captur
 
 
 def end_of_run(folder: Path, rows: list[dict[str, Any]]) -> None:
-    """Print the summary of a run with these rows."""
     made = ResultsDatabase(folder, {"name": "sample"})
     for one in rows:
         made.write_cell(one, [])

@@ -1,5 +1,3 @@
-"""`vibench new`: packages that install, pass their own tests and give rows as they are; bad names leave nothing."""
-
 import subprocess
 import sys
 import tomllib
@@ -14,9 +12,8 @@ from hypothesis import strategies as st
 from running import Main, Vibench, refused, rows, succeeded
 from samples import wire_study, write_study
 
-from vibench import HighFidelitySolver, create
+from vibench import HighFidelitySolver, RequestError, create
 from vibench.cli import scaffold
-from vibench.errors import RequestError
 from vibench.plugins.kinds import CHECKED, PluginKind
 from vibench.plugins.registry import registered
 from vibench.testing.checks import case_of
@@ -29,7 +26,6 @@ NAMES = {
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """One new package of every kind."""
     parent = tmp_path_factory.mktemp("new")
     return {kind: scaffold.write_package(CHECKED[kind], name, parent) for kind, name in NAMES.items()}
 

@@ -1,5 +1,3 @@
-"""Where stages run: the same numbers on a dask cluster, and what becomes of workers that die or are of no use."""
-
 import contextlib
 import os
 import socket
@@ -27,6 +25,7 @@ from running import PATIENCE, Main, Vibench, assert_same_numbers, read_until, re
 from samples import wire_study, write_study
 from template import TEMPLATE, template
 
+from vibench import Study
 from vibench.errors import ExecutorError, RequestError
 from vibench.execution import executors
 from vibench.execution.executors import Dask, Local
@@ -34,7 +33,6 @@ from vibench.execution.run import Observer, Options, run_study
 from vibench.execution.supervisor import Job
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Stage
-from vibench.study.spec import Study
 
 
 def elsewhere(_: str) -> tuple[bool, str, str]:
@@ -168,9 +166,7 @@ def test_a_cluster_that_cannot_start_is_refused_in_a_line(tmp_path: Path) -> Non
         Dask(None, 1, tmp_path)
 
 
-def test_other_code_and_workers_without_artefacts_are_refused(
-    cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_code_or_store_is_refused(cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(executors, "code_here", lambda: "mine")
         with pytest.raises(RequestError, match=r"the dask worker tcp://.* has other code: .* instead of mine"):
@@ -181,9 +177,7 @@ def test_other_code_and_workers_without_artefacts_are_refused(
 
 
 @pytest.mark.long
-def test_a_cluster_that_is_shut_down_stops_the_run_with_a_line_and_it_goes_on_without(
-    plugins_folder: Path, vibench: Vibench, tmp_path: Path
-) -> None:
+def test_a_run_goes_on_without_a_lost_cluster(plugins_folder: Path, vibench: Vibench, tmp_path: Path) -> None:
     waits = {"name": "cone-waits", "options": {"file": str(tmp_path / "go on")}}
     path = write_study(tmp_path, wire_study(dual=["cpg", waits]))
     with pytest.MonkeyPatch.context() as patch:
@@ -204,9 +198,7 @@ def test_a_cluster_that_is_shut_down_stops_the_run_with_a_line_and_it_goes_on_wi
     assert "2 cells, all ok" in done.stdout
 
 
-def test_wrong_requests_for_dask_are_refused_in_a_line(
-    main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wrong_requests_for_dask_are_one_line(main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, there = write_study(tmp_path, wire_study(problem=["obstacle"])), "tcp://127.0.0.1:9"
     for options, expected in (
         (("--executor", "dask", "--scheduler", there), f"no dask scheduler answers at '{there}'"),

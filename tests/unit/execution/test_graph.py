@@ -1,5 +1,3 @@
-"""The order of stages: each once, after what it needs, and none that leads to nothing."""
-
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -17,8 +15,6 @@ from vibench.stages.base import Result, Stage
 
 @dataclass(frozen=True)
 class Node(Stage):
-    """A stage that needs others."""
-
     label = "node"
 
     name: str

@@ -1,5 +1,3 @@
-"""The folder of a run: one run at a time, nothing of others, which cells run again, and columns that name rows."""
-
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -11,7 +9,7 @@ import pytest
 from samples import STUDY as FULL_STUDY
 from samples import cell_row, changed, write_study
 
-from vibench.errors import RequestError
+from vibench import RequestError, Stop
 from vibench.execution import recording
 from vibench.execution.recording import (
     axis_columns,
@@ -22,7 +20,6 @@ from vibench.execution.recording import (
     labels_of,
     refute,
 )
-from vibench.interfaces.strategies import Stop
 from vibench.results.database import ResultsDatabase
 from vibench.results.schema import KEYS, STORED
 from vibench.results.sqlite import FILE
@@ -41,7 +38,6 @@ STUDY = {"name": "sample", "seed": 1, "validation": 4}
 
 
 def refusal(folder: Path) -> str:
-    """The line with which a folder is refused."""
     with pytest.raises(RequestError) as caught, claimed(folder):
         pass
     return str(caught.value)
@@ -152,7 +148,6 @@ def test_an_error_above_its_bound_and_the_accuracy_of_the_reference_refutes_it()
 
 @pytest.fixture
 def study(tmp_path: Path) -> Study:
-    """A study in which every axis has a label of its own."""
     content = changed(FULL_STUDY, "problem", 0, "label", to="membrane")
     content = changed(content, "dual", to=[{"name": "mcpg", "label": "widened"}])
     content = changed(content, "primal", to=[{"name": "offline-pga", "label": "greedy"}])

@@ -1,5 +1,3 @@
-"""Which cells are timed together, when, and when again; which offline stages are timed again."""
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,9 +8,9 @@ import pytest
 from counting import growth
 from samples import SampleStore, carry_out, cell_row, query_rows
 
+from vibench import Status
 from vibench.execution.recording import ResultWriter, labels_of
 from vibench.execution.timing_plan import OfflinePlan, TimingPlan, block_sizes
-from vibench.qp.status import Status
 from vibench.results.break_even import scatter
 from vibench.results.database import ResultsDatabase
 from vibench.stages import timing_rounds
@@ -68,7 +66,6 @@ def timed(stage: TimingRounds, unsteady: float = 0.0) -> tuple[TimedCell, ...]:
 
 
 def record(plan: TimingPlan, stage: TimingRounds | None, unsteady: float = 0.0) -> list[TimingRounds]:
-    """Record a stage and those that follow it; returns all of them."""
     stages = []
     while stage is not None:
         stages.append(stage)
@@ -99,7 +96,6 @@ def test_a_group_is_timed_when_its_last_cell_has_its_row(writer: ResultWriter) -
         assert plan.ended(cell) is None
     write(writer, GROUP[-1], 1, 3)
     stage = plan.ended(GROUP[-1])
-    assert stage is not None
     assert set(stage.cells) == {cell_queries(cell, 20.0) for cell in GROUP}
     fine = dict(zip(stage.cells, stage.queries, strict=True))
     assert fine[cell_queries(GROUP[-1], 20.0)] == (0, 2)
@@ -114,7 +110,6 @@ def test_cells_without_an_ok_query_are_not_timed_and_hold_nobody_up(writer: Resu
         plan.ended(cell)
     write(writer, GROUP[-1])
     stage = plan.ended(GROUP[-1])
-    assert stage is not None
     assert stage.cells == (cell_queries(GROUP[-1], 20.0),)
     assert plan_of(writer).start([])[0].cells == stage.cells
 
@@ -187,7 +182,6 @@ def test_a_cell_that_is_done_again_is_timed_together_with_the_others(writer: Res
     assert plan.start(GROUP[:1]) == []
     write(writer, GROUP[0])
     stage = plan.ended(GROUP[0])
-    assert stage is not None
     assert len(stage.cells) == len(GROUP)
 
 
@@ -289,7 +283,6 @@ def test_the_seconds_of_a_nested_enrichment_are_those_of_its_growth(tmp_path_fac
     store.put(repeat.key, (result := repeat.run(store)).value, result.seconds, ())
     first, again = store.get(enrichment.key), repeat.seconds(store, name)
     assert first is not None
-    assert again is not None
     assert again.cpu == result.value[name][0] > 0.0
     assert repeat.seconds(store, name) == again
     assert OfflineRepeat(source, 2).seconds(store, name) is None

@@ -10,16 +10,14 @@ from hypothesis import strategies as st
 from numerics import Varying, exact, spd
 from scipy.spatial import KDTree
 
-from vibench import Array, HighFidelitySolver, NestedStart, Reduction, create, solve_high_fidelity
-from vibench.arrays import Mask
+from vibench import Array, HighFidelitySolver, Mask, NestedStart, Reduction, Stop, create, solve_high_fidelity
 from vibench.errors import NumericalError
 from vibench.highfidelity import active_set, kkt_systems
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
-from vibench.interfaces.strategies import Stop
 from vibench.linalg.factorisations import DEFAULT
 from vibench.linalg.schur_complement import EliminationPattern
-from vibench.qp.verification import kkt_residuals
+from vibench.qp import kkt_residuals
 from vibench_problems import obstacle
 from vibench_problems.obstacle import Obstacle
 
@@ -195,7 +193,7 @@ class Crooked(Varying):
 
 
 @pytest.mark.parametrize("constant", [frozenset(), frozenset({"A"})], ids=["varying", "constant"])
-def test_a_stiffness_that_is_not_symmetric_is_refused_and_where(
+def test_an_unsymmetric_stiffness_is_refused_and_where(
     constant: frozenset[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, mu = Crooked(), np.array([0.5])

@@ -1,5 +1,3 @@
-"""Sparse systems of active sets against the dense ones, whatever was factorised before."""
-
 import contextlib
 from unittest import mock
 
@@ -10,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import spd
 
-from vibench.errors import NumericalError
+from vibench import NumericalError
 from vibench.highfidelity import kkt_systems
 from vibench.highfidelity.active_set import HighFidelitySolver, solve_unverified, verified
 from vibench.highfidelity.kkt_systems import CondensedStiffness, SaddlePointSolver, ZoneStiffness, watched, zone_of

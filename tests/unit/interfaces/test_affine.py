@@ -1,5 +1,3 @@
-"""Affine sums and problems that consist of them."""
-
 import math
 import pickle
 from typing import Any
@@ -10,9 +8,8 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vibench import AffineProblem, AffineSum, Array, HighFidelitySolver, InnerProduct, ParameterBox
+from vibench import AffineProblem, AffineSum, Array, HighFidelitySolver, InnerProduct, ParameterBox, is_absent
 from vibench.errors import NumericalError, RequestError
-from vibench.interfaces.absent_rows import is_absent
 from vibench.interfaces.affine import CONSTANTS, FUNCTIONS, Expression, Theta
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.affine import Evaluation, affine_decomposition
@@ -219,43 +216,19 @@ def test_safe_expressions_have_the_values_of_python(text: str, a: float, b: floa
 
 
 HOSTILE = {
-    "__import__('os').system('true')": "not a function's name",
-    "().__class__.__base__": "an attribute",
-    "a.real": "an attribute",
-    "open(a)": "no function of expressions is called 'open'",
-    "exp.__call__(a)": "not a function's name",
-    "(lambda: a)()": "not a function's name",
-    "lambda: a": "a lambda",
-    "[a][0]": "an index",
-    "a if b else 1": "a condition",
-    "a < b": "a comparison",
-    "a and b": "a logical operation",
-    "a // b": "an operator that is not",
-    "a ^ 2": r"powers are written \*\*",
-    "~a": "an operator that is not",
-    "'a' * 9": "a text",
-    "True": "contains True",
-    "f'{a}'": "something else",
-    "{a: b}": "something else",
-    "(a := 1)": "something else",
-    "a; b": "not an expression",
-    "a b": "not an expression",
-    "": "not an expression",
-    "\0": "not an expression",
-    "(" * 900 + "a" + ")" * 900: "not an expression",
-    "-" * 5000 + "a": "5000|5001",
-    "-" * 1500 + "a": "nested more than 200 deep|not an expression",
-    "+".join(["a"] * 500): "nested more than 200 deep",
-    "'\\d'": "a text",
-    "c": "no parameter is called 'c'",
-    "exp": "needs arguments",
-    "exp(a, b)": "does not take 2 arguments",
-    "min(a)": "does not take 1 argument",
-    "exp(x=a)": "not a function's name",
-    "exp(*a)": "something else",
-    "1j": "a text|something else",
-    "1" + "0" * 400: "too large",
-}
+    "__import__('os').system('true')": "not a function's name", "().__class__.__base__": "an attribute",
+    "a.real": "an attribute", "open(a)": "no function of expressions is called 'open'",
+    "exp.__call__(a)": "not a function's name", "(lambda: a)()": "not a function's name", "lambda: a": "a lambda",
+    "[a][0]": "an index", "a if b else 1": "a condition", "a < b": "a comparison", "a and b": "a logical operation",
+    "a // b": "an operator that is not", "a ^ 2": r"powers are written \*\*", "~a": "an operator that is not",
+    "'a' * 9": "a text", "True": "contains True", "f'{a}'": "something else", "{a: b}": "something else",
+    "(a := 1)": "something else", "a; b": "not an expression", "a b": "not an expression", "": "not an expression",
+    "\0": "not an expression", "(" * 900 + "a" + ")" * 900: "not an expression", "-" * 5000 + "a": "5000|5001",
+    "-" * 1500 + "a": "nested more than 200 deep|not an expression", "+".join(["a"] * 500): "nested more than 200 deep",
+    "'\\d'": "a text", "c": "no parameter is called 'c'", "exp": "needs arguments",
+    "exp(a, b)": "does not take 2 arguments", "min(a)": "does not take 1 argument", "exp(x=a)": "not a function's name",
+    "exp(*a)": "something else", "1j": "a text|something else", "1" + "0" * 400: "too large",
+}  # fmt: skip
 
 
 def test_what_is_not_arithmetic_not_finite_or_no_name_is_refused() -> None:

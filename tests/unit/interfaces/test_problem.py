@@ -6,12 +6,8 @@ import pytest
 import scipy.sparse as sp
 from numerics import Varying
 
-from vibench import MeshFields, Picture
+from vibench import MeshFields, ParameterBox, Picture, Stop, VariationalInequality, checked_assembly
 from vibench.errors import NumericalError, RequestError
-from vibench.interfaces.parameters import ParameterBox
-from vibench.interfaces.problem import VariationalInequality
-from vibench.interfaces.strategies import Stop
-from vibench.interfaces.validation import checked_assembly
 
 BOX = ParameterBox(("a", "b"), np.array([0.0, -1.0]), np.array([1.0, 3.0]), ("1", "m"))
 

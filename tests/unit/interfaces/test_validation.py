@@ -1,5 +1,3 @@
-"""Members of any unambiguous type are sparse matrices and vectors of float64 afterwards; others are named."""
-
 import re
 from collections.abc import Callable
 from dataclasses import replace

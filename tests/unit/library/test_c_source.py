@@ -1,5 +1,3 @@
-"""Exported C sources, compiled: they answer as the models do, whatever the constraints are like."""
-
 import ctypes
 import re
 import shutil
@@ -18,10 +16,8 @@ import scipy.sparse.linalg
 from samples import small_study, with_ways
 
 import vibench
-from vibench.interfaces.affine_problem import AffineProblem
-from vibench.interfaces.outputs import Output
+from vibench import AffineProblem, Output, export_model
 from vibench.library import reduced_model
-from vibench.library.export import export_model
 from vibench.library.reduced_model import Model as Exported
 from vibench.model.certificates import contact_correction as complementarity
 from vibench.model.certificates.base import Guarantee
@@ -45,7 +41,6 @@ STRICT = ("-std=c99", *PLAIN[1:], "-O2")
 
 
 def library(file: Path, strict: tuple[str, ...] = STRICT) -> ctypes.CDLL:
-    """A C source, compiled without a warning."""
     command = [str(COMPILER), *strict, "-shared", "-fPIC", "-o", file.with_suffix(".so"), file, "-lm"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -57,7 +52,6 @@ def pointers(*arrays: np.ndarray) -> list[Any]:
 
 
 def compiled(file: Path, unknowns: int, constraints: int, strict: tuple[str, ...] = PLAIN) -> Solve:
-    """The function of a C source: its code, x, α, residuals."""
     function = getattr(library(file, strict), f"{file.stem}_solve")
 
     def solve(mu: np.ndarray) -> Answer:
@@ -125,7 +119,6 @@ def certify(model: vibench.Model, file: Path, tolerance: float) -> tuple[Certify
 
 
 def assert_bounded(model: vibench.Model, mu: np.ndarray, u: np.ndarray, lam: np.ndarray, bounds: np.ndarray) -> None:
-    """No error of u and λ is above its bound."""
     exact, vi = model.high_fidelity(mu), model.problem.assemble(mu)
     away, force = exact.u - u, vi.B.T @ (exact.lam - lam)
     assert float(away @ (vi.A @ away)) <= bounds[0] ** 2

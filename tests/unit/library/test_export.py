@@ -1,5 +1,3 @@
-"""Exported models answer as the models do, without vibench; what cannot be exported is refused with a line."""
-
 import json
 import re
 import subprocess
@@ -20,8 +18,8 @@ from running import Main, refused, succeeded
 from samples import with_ways
 
 import vibench
+from vibench import export_model
 from vibench.library import reduced_model
-from vibench.library.export import export_model
 from vibench.library.reduced_model import Model as Exported
 from vibench.model.affine import affine_decomposition
 from vibench.model.certificates.base import Guarantee
@@ -107,7 +105,6 @@ def assembled_in_full(template: vibench.Model, problem: vibench.Problem, kind: v
 
 
 def with_row(template: vibench.Model, queried: Any) -> vibench.Model:
-    """A model that answers queries, with the row of a real cell."""
     offline = vibench.Reduction(queried.problem, None, None, None, None).given(assembled=queried)
     return replace(template, offline=offline, certificate=None)
 

@@ -1,5 +1,3 @@
-"""Progress: the time left, durations in words, and what is printed where there is no terminal."""
-
 import io
 from collections.abc import Sequence
 from itertools import pairwise
@@ -12,9 +10,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 from samples import STUDY, changed, write_study
 
-from vibench.execution.graph import Graph
+from vibench import Stop
 from vibench.execution.run import Agenda
-from vibench.interfaces.strategies import Stop
 from vibench.library.progress import DrawingDisplay, ProgressDisplay, TimeLeft, duration
 from vibench.plugins.plugin import Plugin
 from vibench.stages.base import Stage
@@ -102,46 +99,6 @@ def test_what_was_never_seen_is_estimated_from_its_effort(queries: list[Stage]) 
     assert left.seconds() == pytest.approx(2 * 1.0 + 2 * 10.0)
 
 
-RECORDED = {
-    "high-fidelity solutions of the training set": 22.0, "high-fidelity solutions of the validation set": 19.0,
-    "high-fidelity constants": 38.5, "certificate base": 20.0, "certificate": 3.0, "queries with piqp": 33.0,
-}  # fmt: skip
-"""Mean wall seconds of the stages of `three-dimensions` at medium, in a run of 11 minutes; others took less than 1."""
-
-SOLUTIONS = 27
-"""Training solutions of a part; the first one has the set-up."""
-
-
-def test_a_run_in_space_says_in_its_first_minute_how_long_it_will_take(clock: list[float]) -> None:
-    """Two workers, looked at every five seconds, with stages that take what they took in a run."""
-    cells = [cell for cell in expand(read_study("three-dimensions")) if "medium" in str(cell)]
-    graph, now = Graph(), clock
-    running, estimates = dict[str, tuple[Stage, float, float]](), list[tuple[float, float]]()
-    for cell in cells:
-        graph.add_goal(cell_queries(cell, 20.0), lambda _: False)
-    now[0], left = 0.0, TimeLeft(list(graph.stages.values()), 2)
-    while graph.waiting or running:
-        for stage in graph.begin(2 - len(running)):
-            left.begin(stage)
-            running[stage.key] = stage, now[0], now[0] + RECORDED.get(stage.kind_of_work, 0.5)
-        told = []
-        for stage, began, end in running.values():
-            solved = int(max(0.0, (now[0] - began) / (end - began) * (SOLUTIONS + 4) - 4)) / SOLUTIONS
-            told.append((stage, solved if isinstance(stage, SnapshotStage) else 0.0))
-        left.fractions_done(told)
-        if (seconds := left.seconds()) is not None:
-            estimates.append((now[0], seconds))
-        first = min(end for _, _, end in running.values())
-        now[0] = min(now[0] + 5.0, first)
-        for stage, began, end in [one for one in running.values() if one[2] <= now[0]]:
-            left.done(running.pop(stage.key)[0], end - began)
-            graph.done(stage)
-    assert estimates[0][0] < 60.0
-    assert 500.0 < now[0] < 700.0
-    compared = [(at, seconds / (now[0] - at)) for at, seconds in estimates if at < 0.9 * now[0]]
-    assert all(1.0 / 1.5 < ratio < 1.5 for at, ratio in compared if at > 20.0), compared
-
-
 def test_the_time_left_costs_the_same_however_much_is_done() -> None:
     def estimate(done: int) -> int:
         left = TimeLeft(PODS, 1)
@@ -163,7 +120,6 @@ def test_a_duration_in_words_is_about_the_duration(seconds: float) -> None:
 
 
 def report(*, terminal: bool = False) -> tuple[ProgressDisplay, io.StringIO]:
-    """A report and what it prints."""
     printed = io.StringIO()
     return ProgressDisplay(Console(file=printed, force_terminal=terminal, width=120)), printed
 

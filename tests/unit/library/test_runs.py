@@ -1,5 +1,3 @@
-"""Studies and runs from Python."""
-
 import builtins
 import signal
 from html import escape
@@ -31,7 +29,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
 
 
 def following(**calls: Any) -> Mock:
-    """An observer that counts what it is told."""
     return Mock(spec=Observer, **calls)
 
 

@@ -1,5 +1,3 @@
-"""Models as servers of UM-Bridge: the client finds the answers of the model, whatever others send to the server."""
-
 import json
 import os
 import signal
@@ -51,9 +49,7 @@ def client_of(server: ModelServer) -> umbridge.HTTPModel:
     return umbridge.HTTPModel(f"http://127.0.0.1:{server.server_address[1]}", "obstacle")
 
 
-def test_a_client_finds_the_answers_and_bounds_of_the_model(
-    server: ModelServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_client_finds_answers_and_bounds_of_the_model(server: ModelServer, monkeypatch: pytest.MonkeyPatch) -> None:
     model, client = server.model, client_of(server)
     assert (client.get_input_sizes(), client.get_output_sizes()) == ([3], [len(server.outputs)] * 2)
     assert client.supports_evaluate()

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import vibench
-from vibench import Reduction, RequestError, Stop, create
-from vibench.library.vtu import export_vtu
+from vibench import Reduction, RequestError, Stop, create, export_vtu
 from vibench.offline.reduction import high_fidelity_sweep
 
 meshio = pytest.importorskip("meshio")

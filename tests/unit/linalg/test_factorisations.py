@@ -1,10 +1,8 @@
-"""Every implementation of factorisations against dense matrices; and what it has to refuse."""
-
 import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from vibench.errors import NumericalError, RequestError
+from vibench import NumericalError, RequestError
 from vibench.linalg.factorisations import IMPLEMENTATIONS, Implementation, implementation
 from vibench.linalg.proofs import is_proved_definite
 
@@ -23,7 +21,6 @@ BODIES = pytest.mark.parametrize("sizes", [(15,), (9, 12)], ids=["one body", "tw
 
 
 def membranes(sizes: Sizes, weight: float = 1.0) -> sp.csc_array:
-    """Stiffnesses of square membranes that do not touch."""
     blocks = []
     for n in sizes:
         line = sp.diags_array([-np.ones(n - 1), 2.1 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])

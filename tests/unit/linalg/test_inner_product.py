@@ -7,14 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import space, spd
 
-from vibench.errors import NumericalError
-from vibench.linalg.inner_product import (
-    InnerProduct,
-    factorised_later,
-    orthonormal_range,
-    project_out,
-    singular_values,
-)
+from vibench import NumericalError
+from vibench.linalg.inner_product import InnerProduct, factorised_later, orthonormal_range, project_out, singular_values
 
 seeds = st.integers(0, 10_000)
 

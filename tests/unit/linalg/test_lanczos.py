@@ -1,5 +1,3 @@
-"""Extreme eigenvalues against dense ones."""
-
 import numpy as np
 import pytest
 import scipy.linalg

@@ -5,11 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import Varying, spd
 
-from vibench.errors import NumericalError
+from vibench import HighFidelitySolver, NumericalError, VariationalInequality
 from vibench.highfidelity import active_set
-from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.highfidelity.kkt_systems import CondensedStiffness
-from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix, StaticCondensation
 
 

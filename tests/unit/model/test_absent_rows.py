@@ -9,10 +9,8 @@ import scipy.sparse as sp
 from numerics import Varying
 from samples import pga_reduction
 
-from vibench import AffineProblem, Array, InnerProduct, ParameterBox, VariationalInequality
-from vibench.errors import NumericalError
+from vibench import AffineProblem, Array, InnerProduct, NumericalError, ParameterBox, Sampler, VariationalInequality
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.problem import Sampler
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.affine import Evaluation, affine_decomposition
 from vibench.qp.solve import installed_solvers, solve_qp

@@ -8,9 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import Varying, spd
 
-from vibench.errors import NumericalError
-from vibench.interfaces.affine import AffineSum
-from vibench.interfaces.problem import MEMBERS, Contact, VariationalInequality
+from vibench import MEMBERS, AffineSum, Contact, NumericalError, VariationalInequality
 from vibench.model.affine import Evaluation, affine_decomposition, coefficients, decomposed, held_out_error, interpolate
 
 NEW = np.array([0.37])
@@ -62,7 +60,6 @@ class Summed(Varying):
 
 
 def declaring(base: type[Varying], **declarations: frozenset[str]) -> type[Varying]:
-    """A problem class that declares more."""
     return type("Declaring", (base,), declarations)
 
 
@@ -246,7 +243,6 @@ TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)
 
 
 def of_rank(rank: int, seed: int, size: int = 30, count: int = 9) -> np.ndarray:
-    """Random vectors (size×count) in a space of few dimensions."""
     rng = np.random.default_rng(seed)
     return rng.standard_normal((size, rank)) @ rng.standard_normal((rank, count))
 
@@ -259,7 +255,6 @@ def family(seed: int, size: int = 40, count: int = 20) -> np.ndarray:
 
 
 def largest_error(snapshots: np.ndarray, points: np.ndarray, modes: np.ndarray) -> float:
-    """Largest error of any column, relative to the longest."""
     rebuilt = [sum(v[p] * mode for p, mode in zip(points, modes.T, strict=True)) for v in snapshots.T]
     errors = [np.linalg.norm(v - w) for v, w in zip(snapshots.T, rebuilt, strict=True)]
     return float(max(errors) / max(np.linalg.norm(v) for v in snapshots.T))

@@ -8,23 +8,16 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numerics import Varying, space
 
+from vibench import Problem, VariationalInequality
 from vibench.highfidelity import active_set
 from vibench.highfidelity.kkt_systems import CondensedStiffness
-from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.model.error_bounds import error_bounds
 from vibench.model.errors import UNMEASURABLE, EnergyNorm, ReferenceSolutions, errors
 from vibench.model.hsw_bounds import hsw_bounds
-from vibench.reduction.supremizers import constraint_classes
+from vibench.reduction import constraint_classes
+from vibench.stability import cone_basis, inf_sup_full, inf_sup_on
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
-from vibench.stability.infsup import (
-    InfSup,
-    cone_basis,
-    constants_full,
-    constants_on,
-    inf_sup_full,
-    inf_sup_on,
-    nodal_cone,
-)
+from vibench.stability.infsup import InfSup, constants_full, constants_on, nodal_cone
 
 PROBLEM = Varying()
 

@@ -9,17 +9,12 @@ from hypothesis import strategies as st
 from numerics import Varying
 from other_problems import Torsion
 
-from vibench.errors import RequestError
+from vibench import MEMBERS, HighFidelitySolution, Problem, RequestError, checked_assembly, solve_qp, supremizers
 from vibench.highfidelity import active_set
-from vibench.highfidelity.active_set import HighFidelitySolution
-from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.interfaces.strategies import Enrichment, Kind
-from vibench.interfaces.validation import checked_assembly
 from vibench.model import galerkin
 from vibench.model.galerkin import ReducedModel, project, projected_members
-from vibench.qp.solve import solve_qp
-from vibench.reduction.supremizers import supremizers
-from vibench.stability.infsup import cone_basis
+from vibench.stability import cone_basis
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 

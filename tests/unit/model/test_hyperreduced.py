@@ -1,5 +1,3 @@
-"""Queries without arrays of mesh size give the programs of queries in full."""
-
 import pickle
 import sys
 import tracemalloc
@@ -15,21 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import Varying
 
-from vibench.errors import NumericalError
-from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.affine import AffineSum
+from vibench import AffineSum, HighFidelitySolver, NumericalError, Status, checked_assembly, solve_qp, supremizers
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.strategies import Enrichment, Kind
-from vibench.interfaces.validation import checked_assembly
-from vibench.linalg.inner_product import singular_values
+from vibench.linalg import singular_values
 from vibench.model.affine import Evaluation, affine_decomposition
 from vibench.model.galerkin import ReducedModel, project
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce, reason_for_full_assembly
 from vibench.qp import verification
-from vibench.qp.solve import solve_qp
-from vibench.qp.status import Status
-from vibench.reduction.supremizers import supremizers
-from vibench.stability.infsup import cone_basis
+from vibench.stability import cone_basis
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 
@@ -93,7 +85,6 @@ class Rope(Varying):
 
 @cache
 def rope(constraint: str, stiffness: str = "several") -> Rope:
-    """A rope that tests share."""
     return Rope(constraint, stiffness)
 
 
@@ -110,7 +101,6 @@ def solutions(problem: Problem, mus: tuple[tuple[float, ...], ...]) -> tuple[np.
 
 @cache
 def separation(problem: Problem) -> Mapping[str, Any]:
-    """Its members, interpolated to round-off."""
     return affine_decomposition(problem, problem.training_set(), 1e-11)
 
 
@@ -169,7 +159,7 @@ SIZES = [("constant", 3, 2), ("several", 3, 2), ("constant", 3, 0), ("constant",
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("constraint", WAYS)
 @pytest.mark.parametrize(("stiffness", "modes", "generators"), SIZES)
-def test_programs_are_those_of_the_full_assembly(
+def test_programs_are_fully_assembled_ones(
     constraint: str, stiffness: str, modes: int, generators: int, kind: str
 ) -> None:
     """Also without modes or without generators."""
@@ -221,7 +211,7 @@ def test_members_on_the_contact_and_interpolated_ones_go_together(entrywise: str
 
 @given(st.integers(14, 40), st.integers(3, 9), st.integers(1, 5), st.integers(1, 5), st.sampled_from(WAYS))
 @settings(max_examples=15)
-def test_programs_of_spaces_that_depend_on_mu_are_right_in_all_dimensions(
+def test_spaces_that_depend_on_mu_have_the_programs(
     n: int, m: int, modes: int, generators: int, constraint: str
 ) -> None:
     """Where supremizers of several terms are as many as unknowns, too."""
@@ -263,9 +253,7 @@ def test_operators_travel() -> None:
         ("several", "contact", "none", 4, False),
     ],
 )
-def test_a_factor_comes_with_a_constant_stiffness_on_a_fixed_space(
-    stiffness: str, constraint: str, kind: str, modes: int, dual: bool
-) -> None:
+def test_constant_stiffness_gives_a_factor(stiffness: str, constraint: str, kind: str, modes: int, dual: bool) -> None:
     query = online(reduced_model(rope(constraint, stiffness), kind, modes, 3)).assemble(NEW[1])
     assert (query.factor is not None) == dual
     primal = solve_qp(query.program, "piqp", 1e-10)

@@ -1,5 +1,3 @@
-"""Errors of quantities of interest: by hand on a few numbers, zeros apart, and one line for what is wrong."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +8,7 @@ from hypothesis.extra.numpy import arrays
 from samples import with_ways
 
 import vibench
-from vibench.errors import NumericalError, RequestError
-from vibench.interfaces.outputs import Output
+from vibench import NumericalError, Output, RequestError
 from vibench.model.certificates.base import output_weights
 from vibench.model.certificates.bounds import OnlineBound, output_error_bound
 from vibench.model.errors import ReferenceSolutions, output_errors, output_scales, summarise_outputs

@@ -7,7 +7,7 @@ from decimals import ExactProgram, exactly
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vibench.interfaces.problem import VariationalInequality
+from vibench import VariationalInequality
 from vibench.model.proved_norms import ProvedNorms
 from vibench.qp.verification import extended
 

@@ -1,13 +1,10 @@
-"""What a problem assembles, kept while there is room for it."""
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numerics import Varying
 
-from vibench.arrays import Array
-from vibench.interfaces.problem import VariationalInequality
+from vibench import Array, VariationalInequality
 from vibench.linalg.factorisations import IMPLEMENTATIONS
 from vibench.offline import assemblies
 from vibench.offline.assemblies import Assemblies

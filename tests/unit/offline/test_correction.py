@@ -1,5 +1,3 @@
-"""Queries that answer with the pair that their certificate corrects: rows, bounds, models."""
-
 from itertools import product
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Reduced models of a run: queries at any parameter."""
-
 import warnings
 from itertools import product
 
@@ -8,7 +6,7 @@ import pytest
 from samples import SMALL, small_study, with_ways
 
 import vibench
-from vibench.interfaces.problem import MEMBERS
+from vibench import MEMBERS
 from vibench.interfaces.validation import validation_parameters
 from vibench.model.bound_terms import BoundNote
 from vibench.model.galerkin import ReducedProblem
@@ -83,9 +81,7 @@ def test_many_parameters_give_a_table(model: vibench.Model, mus: np.ndarray, cer
     assert {"bound_u_energy", "guarantee", "verdict"} <= set(table)
 
 
-def test_a_table_of_many_assembles_what_single_queries_do(
-    model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_table_assembles_as_queries(model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     sizes, solved, real = list[int](), list[ReducedProblem](), models.Model._solution
     if isinstance(model.reduced, HyperReducedModel):
         mus = np.vstack([model.parameters.sample(257, seed=1), mus])
@@ -125,9 +121,7 @@ def test_parameters_outside_their_domain_are_warned_of_and_what_is_none_refused(
         parameter_in(box, {letter: 1.5, micro: 1.5, "e": 2.0})
 
 
-def test_missing_solvers_and_answers_are_named(
-    model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_solutions_are_named(model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(vibench.RequestError, match="no QP solver is called 'piqpp'; did you mean 'piqp'"):
         model.solve(mus[0], solver="piqpp")
     monkeypatch.setattr("vibench.offline.models.installed_solvers", lambda _: ["piqp"])

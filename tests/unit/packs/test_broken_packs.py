@@ -1,7 +1,3 @@
-"""Packs with one mistake that an exporting user may make: each has a line of its own, and none runs."""
-
-from __future__ import annotations
-
 import gzip
 import io
 import os
@@ -19,10 +15,8 @@ from packs import SIZE, Cable, manifest, write_arrays, write_cable, write_manife
 from running import Main
 from samples import write_study
 
-from vibench.errors import RequestError
-from vibench.packs import reader
-from vibench.packs.checks import read_model_pack
-from vibench.study.matrix import read_study
+from vibench import RequestError, read_study
+from vibench.packs import read_model_pack, reader
 
 Content = dict[str, Any]
 Mistake = Callable[[Cable, Path], Content]
@@ -282,11 +276,8 @@ changed("row in two intervals", "K: a row of the dual set is in two blocks", {"K
         {"rows": lambda c: np.array([0, 4])})  # fmt: skip
 changed("snapshots outside K", "solutions.lam leaves K by .*: in K are intervals",
         DUAL_HALF | {"K": [{"kind": "interval", "radius": 1e-3}]})  # fmt: skip
-changed(
-    "solutions outside K",
-    "does not solve the problem: A u . Bᵀλ = f is violated",
-    {"K": [{"kind": "interval", "radius": 1e-3}]},
-)
+changed("solutions outside K", "does not solve the problem: A u . Bᵀλ = f is violated",
+        {"K": [{"kind": "interval", "radius": 1e-3}]})  # fmt: skip
 
 
 @pytest.fixture
@@ -320,7 +311,6 @@ def test_a_mistake_has_its_line(name: str, broken: Callable[[str], Path]) -> Non
 
 
 def study_on(folder: Path, validation: int) -> Content:
-    """A study on a pack."""
     return {
         "name": "broken", "validation": validation, "solvers": ["piqp"], "dual": ["cpg"], "primal": ["decorrelated"],
         "problem": [{"name": "pack", "options": {"path": str(folder)}}], "tolerances": [{"N": [1], "R": [1]}],

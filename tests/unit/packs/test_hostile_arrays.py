@@ -1,7 +1,5 @@
 """Arrays that no code wrote in good faith: each ends in one line, and no interpreter ends because of it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,7 +12,7 @@ import pytest
 from packs import Cable as Arrays
 from packs import manifest, write_cable, write_manifest
 
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.packs import read_model_pack
 
 N = 12
@@ -88,7 +86,6 @@ MARKET = {
 
 
 def write(folder: Path, **parts: Any) -> Path:
-    """A pack whose A has these arrays."""
     np.savez(write_cable(folder) / "A.npz", **parts)
     return folder
 

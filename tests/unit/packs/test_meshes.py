@@ -1,7 +1,3 @@
-"""Meshes of others: formats of one file, read in a process whose memory and seconds are limited."""
-
-from __future__ import annotations
-
 import base64
 import os
 import zlib
@@ -11,7 +7,7 @@ import numpy as np
 import pytest
 from packs import manifest, write_cable, write_manifest, write_mesh
 
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.packs import pack_digest, read_model_pack
 from vibench.packs.meshes import read_mesh
 
@@ -24,7 +20,6 @@ VTU = """<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian
 
 
 def with_mesh(folder: Path, name: str, secret: str = "") -> Path:
-    """A pack with a mesh of this name."""
     table = write_mesh(write_cable(folder), name, secret)
     write_manifest(folder, manifest({"mesh": table}))
     return folder
@@ -39,7 +34,6 @@ MORE = (
 @pytest.mark.parametrize("ending", [".vtu", *MORE])
 def test_formats_of_one_file_are_read(ending: str, tmp_path: Path) -> None:
     mesh = read_model_pack(with_mesh(tmp_path / "pack", f"mesh{ending}")).mesh
-    assert mesh is not None
     corners = mesh.points[:, mesh.triangles]  # their numbers are those of the file, but in .stl
     assert np.allclose(corners, np.array([[[0, 1], [1, 2], [11, 11]], [[0, 0], [0, 0], [11, 11]]]) / 11, atol=1e-7)
 

@@ -1,7 +1,3 @@
-"""Quantities of interest of model packs: linear ones are written and read; mistakes are named."""
-
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +5,7 @@ import numpy as np
 import pytest
 from packs import SIZE, manifest, write_cable, write_manifest
 
-from vibench import create
-from vibench.errors import RequestError
+from vibench import RequestError, create
 from vibench.packs import read_model_pack
 from vibench.packs.writer import write_pack
 
@@ -18,7 +13,6 @@ FORCE = {"name": "force", "unit": "N", "lam": "outputs.npz:lam"}
 
 
 def write(folder: Path, outputs: list[dict[str, Any]]) -> Path:
-    """A pack with outputs."""
     write_manifest(write_cable(folder), manifest({"outputs": outputs}))
     np.savez(folder / "outputs.npz", u=np.arange(SIZE, dtype=float), lam=np.ones(SIZE), short=np.ones(SIZE - 1))
     return folder

@@ -1,7 +1,3 @@
-"""Model packs: what is read is what was written, in every format, and results of an edited one are not used again."""
-
-from __future__ import annotations
-
 import codecs
 import gzip
 import json
@@ -18,18 +14,12 @@ from packs import DEPTH, SIZE, Cable, group, manifest, write_arrays, write_cable
 from running import Main
 from samples import write_study
 
-from vibench.errors import NumericalError, RequestError
+from vibench import MEMBERS, NumericalError, RequestError, VariationalInequality, checked_assembly, create, read_study
 from vibench.highfidelity.active_set import HighFidelitySolver, solve_high_fidelity
 from vibench.interfaces.absent_rows import ABSENT
-from vibench.interfaces.problem import MEMBERS, VariationalInequality
-from vibench.interfaces.validation import checked_assembly
-from vibench.packs import writer
-from vibench.packs.checks import read_model_pack
+from vibench.packs import pack_digest, read_model_pack, writer
 from vibench.packs.pack import ModelPack, reduce_multipliers
-from vibench.packs.reader import pack_digest
 from vibench.plugins.plugin import Plugin
-from vibench.plugins.registry import create
-from vibench.study.matrix import read_study
 from vibench.testing.problems import continuity
 from vibench_problems.tresca import Tresca
 
@@ -137,10 +127,8 @@ def test_numbers_may_be_stored_in_few_digits(tmp_path: Path, precision: type) ->
     for dtype in (precision, np.float64):
         folder = tmp_path / str(np.dtype(dtype))
         folder.mkdir()
-        groups = {
-            name: parts | {f"{name}/data": parts[f"{name}/data"].astype(precision).astype(dtype)}
-            for name, parts in stored.items()
-        }
+        few = {name: parts[f"{name}/data"].astype(precision).astype(dtype) for name, parts in stored.items()}
+        groups = {name: parts | {f"{name}/data": few[name]} for name, parts in stored.items()}
         np.savez(folder / "spaces.npz", **groups["X_V"], **groups["X_W"])
         np.savez(folder / "more.npz", **groups["A"], **groups["B"])
         np.savez(folder / "vectors.npz", mass=mass.astype(dtype))
@@ -268,9 +256,7 @@ def test_import_solves_once_and_reads_a_byte_order_mark(tmp_path: Path, main: Ma
     assert read_study(str(study)).name == "marked"
 
 
-def test_import_refuses_a_pack_without_a_solution_and_says_which_rows_constrain_nothing(
-    tmp_path: Path, main: Main
-) -> None:
+def test_import_refuses_a_pack_without_a_solution_and_names_empty_rows(tmp_path: Path, main: Main) -> None:
     cable = Cable()
     kept = cable.B
     cable.B = sp.csr_array(sp.vstack([kept[:6], -kept[:6]]))
@@ -318,9 +304,7 @@ def test_a_pack_is_written_whole_or_not_at_all(tmp_path: Path, main: Main, monke
     assert [path.name for path in Path().iterdir()] == ["new"]
 
 
-def test_a_problem_of_constants_and_declared_sums_is_assembled_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_constants_and_declared_sums_are_assembled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     problem, assembled = create("problem", "pack", {"path": str(write_cable(tmp_path / "pack"))}), []
     monkeypatch.setattr(writer, "checked_assembly", lambda *given: assembled.append(1) or checked_assembly(*given))
     writer.write_pack(problem, tmp_path / "new", name="cable", source="", validation=2, seed=0)

@@ -15,12 +15,13 @@ from functools import partial
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from fake_plugins import Wire
 
 import vibench
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.execution.isolated import recall_reads, watch_first_use
 from vibench.execution.supervisor import Supervisor
 from vibench.plugins import plugin as module
@@ -82,16 +83,13 @@ def hashed(source: str = SOURCE, what: str = "Shape()") -> str:
 
 EDITS = {
     "body of a method": ("self.sides * width()", "self.sides + width()"),
-    "constant in a method": ('{"left", "top"}', '{"left", "bottom"}'),
-    "inherited method": ("3.0 * x", "3.5 * x"),
-    "global constant": ("LENGTH = 2.0", "LENGTH = 2.5"),
-    "global set": ('"bottom", "top"}\n', '"bottom"}\n'),
-    "function that a function calls": ("x / 2.0", "x / 4.0"),
-    "attribute of the class": ("sides = 4", "sides = 5"),
+    "constant in a method": ('{"left", "top"}', '{"left", "bottom"}'), "inherited method": ("3.0 * x", "3.5 * x"),
+    "global constant": ("LENGTH = 2.0", "LENGTH = 2.5"), "global set": ('"bottom", "top"}\n', '"bottom"}\n'),
+    "function that a function calls": ("x / 2.0", "x / 4.0"), "attribute of the class": ("sides = 4", "sides = 5"),
     "default of an argument": ("size=5", "size=6"),
     "attribute of the object": ("np.arange(size)", "np.arange(size) + 1"),
     "computed when asked for": ("sum(self.values)", "max(self.values)"),
-}
+}  # fmt: skip
 
 
 def test_fingerprints_change_with_exactly_the_edits_that_may_change_a_number() -> None:
@@ -114,9 +112,8 @@ def test_fingerprints_change_with_exactly_the_edits_that_may_change_a_number() -
 def test_processes_with_other_hash_seeds_agree(tmp_path: Path) -> None:
     """A script, `__main__`, and here a cell of a notebook in another file: one class, one fingerprint."""
     script = tmp_path / "script.py"
-    script.write_text(
-        f"{dedent(SOURCE)}\nfrom vibench.plugins.plugin import fingerprint_of\nprint(fingerprint_of(Shape()))\n"
-    )
+    last = "from vibench.plugins.plugin import fingerprint_of\nprint(fingerprint_of(Shape()))\n"
+    script.write_text(f"{dedent(SOURCE)}\n{last}")
     seeds = ({"PYTHONHASHSEED": seed} for seed in ("1", "2"))
     run = [sys.executable, str(script)]
     printed = [subprocess.check_output(run, env=os.environ | seed, text=True).strip() for seed in seeds]
@@ -136,7 +133,6 @@ def test_an_imported_module_counts_with_its_sources(tmp_path: Path, monkeypatch:
 
 @pytest.fixture(scope="module")
 def names() -> dict[str, Any]:
-    """Names of a notebook with a problem of its own."""
     source = """
         import threading
         from fake_plugins import Wire
@@ -228,9 +224,7 @@ def test_labels_and_options_tell_objects_and_classes_apart(names: dict[str, Any]
     assert [cell.problem.create().V.dim for cell in cells] == [12, 9, 6, 8]
 
 
-def test_the_definition_of_a_cell_holds_no_object_and_a_pickled_plugin_brings_it(
-    names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_definition_holds_no_object_and_a_pickle_does(names: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """It is found again by what made it, and refused in a line where that is not: another process, edited code."""
     (cell,) = expand(study(problem=[names["Mine"](9)]))
     content = json.loads(cell.definition)
@@ -344,3 +338,13 @@ def test_what_strategies_and_formulations_import_late_counts(tmp_path: Path, mon
             plugin = Plugin.of(give(PluginKind[kind], name, given), {})
             read |= {*(watch_first_use(plugin, [], note=print, supervisor=supervisor, seconds=60.0) or ())}
     assert {*map(str, files)} <= read
+
+
+def test_a_run_recalls_what_its_own_plugins_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before it plans, with a process that watches those never used before."""
+    asked = Mock(side_effect=KeyboardInterrupt)
+    monkeypatch.setattr("vibench.execution.run.recall_reads", lambda plugins, *more: asked([*plugins], *more))
+    with pytest.raises(KeyboardInterrupt):
+        vibench.run(study(), tmp_path / "run", jobs=1, progress=False)
+    (plugins, _, watch) = asked.call_args.args
+    assert ([one.name for one in plugins], watch.func) == (["Wire"], watch_first_use)

@@ -1,5 +1,3 @@
-"""Plugins: found through entry points, refused with a reason, created from checked options."""
-
 import datetime
 import importlib.metadata
 import sys
@@ -16,13 +14,11 @@ from annotated_types import Ge, Gt, Le, Lt, MinLen
 from running import Register
 from samples import FAKES, install
 
-from vibench.errors import RequestError
-from vibench.interfaces.strategies import DualStrategy
+from vibench import DualStrategy, RequestError, read_study
 from vibench.plugins import registry
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find, registered
-from vibench.study.matrix import read_study
 from vibench.study.spec import Entry
 
 HERE = __name__
@@ -159,7 +155,7 @@ def test_a_name_of_two_packages_or_of_a_solver_of_qpsolvers_is_refused(register:
     assert find(PluginKind.SOLVER, "osqp").conflict == ""
 
 
-def test_names_are_sorted_and_each_distribution_is_one(
+def test_names_are_sorted_each_distribution_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, register: Register
 ) -> None:
     for folder in ("one", "other"):
@@ -187,9 +183,7 @@ UNLOADABLE = [
 ]
 
 
-def test_the_entry_point_is_named_if_broken(
-    register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_broken_entry_point_is_named(register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     failing = {"raises": "raise OSError('no licence')", "divides": "1 / 0", "syntax": "def f(:"}
     for name, code in failing.items():
@@ -235,25 +229,20 @@ def test_options_that_fit_reach_the_constructor_and_others_are_refused_with_what
 
 
 REFUSED = [
-    ({"weight": 0.0}, ("'weight'", "0.0", "float > 0 and < 1")),
-    ({"weight": 1.5}, ("'weight'", "1.5", "< 1")),
-    ({"weight": "half"}, ("'weight'", "'half'", "float")),
-    ({"weight": True}, ("'weight'", "True", "float")),
+    ({"weight": 0.0}, ("'weight'", "0.0", "float > 0 and < 1")), ({"weight": 1.5}, ("'weight'", "1.5", "< 1")),
+    ({"weight": "half"}, ("'weight'", "'half'", "float")), ({"weight": True}, ("'weight'", "True", "float")),
     ({"weight": float("nan")}, ("'weight'", "nan", "float")),
     ({"weight": 0.5, "count": 10}, ("'count'", "10", "int ≥ 1 and ≤ 9")),
     ({"weight": 0.5, "count": 2.0}, ("'count'", "2.0", "int")),
     ({"weight": 0.5, "mode": "quick"}, ("'mode'", "'quick'", "'slow', 'fast'")),
     ({"weight": 0.5, "grid": 1}, ("'grid'", "1", "'coarse', 'fine' or int ≥ 2")),
-    ({"weight": 0.5, "exact": 1}, ("'exact'", "1", "bool")),
-    ({"weight": 0.5, "names": []}, ("'names'", "list")),
+    ({"weight": 0.5, "exact": 1}, ("'exact'", "1", "bool")), ({"weight": 0.5, "names": []}, ("'names'", "list")),
     ({"weight": 0.5, "names": [1]}, ("'names'", "list")),
     ({"weight": 0.5, "exact": datetime.date(2022, 1, 1)}, ("'exact'", "bool")),
     ({"weight": 0.5, "wieght": 0.5}, ("'wieght'", "did you mean 'weight'")),
-    ({}, ("'weight'", "needs", "float > 0 and < 1")),
-    ({"weight": 0.5, "point": [1.0]}, ("'point'",)),
-    ({"weight": 0.5, "point": [1.0, "x"]}, ("'point'",)),
-    ({"weight": 0.5, "colour": "green"}, ("'colour'",)),
-]
+    ({}, ("'weight'", "needs", "float > 0 and < 1")), ({"weight": 0.5, "point": [1.0]}, ("'point'",)),
+    ({"weight": 0.5, "point": [1.0, "x"]}, ("'point'",)), ({"weight": 0.5, "colour": "green"}, ("'colour'",)),
+]  # fmt: skip
 
 
 @pytest.mark.usefixtures("_own")

@@ -1,5 +1,3 @@
-"""Reduced programs solved to round-off: KKT conditions, uniqueness of the multipliers, and what cannot be solved."""
-
 from itertools import combinations
 
 import numpy as np
@@ -8,11 +6,10 @@ import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vibench.interfaces.problem import VariationalInequality
+from vibench import VariationalInequality, solve_qp
+from vibench.qp import kkt_residuals
 from vibench.qp.exact import exact_solution, rows_that_matter
 from vibench.qp.scaling import size
-from vibench.qp.solve import solve_qp
-from vibench.qp.verification import kkt_residuals
 
 
 def program(seed: int, n: int, m: int, scale: float = 1.0) -> VariationalInequality:

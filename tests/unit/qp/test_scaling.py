@@ -1,5 +1,3 @@
-"""Units of quadratic programs: scaling loses nothing, and without load a program is solved in any units of its data."""
-
 from dataclasses import replace
 from itertools import product
 
@@ -11,8 +9,7 @@ from hypothesis import strategies as st
 from numerics import exact, spd
 from samples import SOLVERS_OF_TESTS
 
-from vibench.interfaces.parameters import ParameterBox
-from vibench.interfaces.problem import MEMBERS, VariationalInequality
+from vibench import MEMBERS, ParameterBox, QPSolution, Status, VariationalInequality, solve_qp
 from vibench.qp import verification
 from vibench.qp.scaling import (
     drive,
@@ -25,9 +22,6 @@ from vibench.qp.scaling import (
     units_of,
     units_of_dual,
 )
-from vibench.qp.solve import solve_qp
-from vibench.qp.status import Status
-from vibench.qp.verification import QPSolution
 from vibench.stages.query import ProgramQuery
 
 seeds = st.integers(0, 10_000)

@@ -11,20 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import exact, spd
 
-from vibench.errors import NumericalError
-from vibench.interfaces.problem import VariationalInequality
+from vibench import NumericalError, QPSolution, Status, VariationalInequality
 from vibench.qp import solve, verification
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import DIRECT, installed_solvers, solve_qp
-from vibench.qp.status import Status
-from vibench.qp.verification import QPSolution
 from vibench.text import LONGEST
 
 seeds = st.integers(0, 10_000)
 
 
 def program(seed: int, n: int = 6, m: int = 4, sizes: tuple[int, int] = (-4, 4)) -> VariationalInequality:
-    """A feasible program with rows and cost of very different sizes."""
     rng = np.random.default_rng(seed)
     B = rng.standard_normal((m, n)) * 10.0 ** rng.integers(*sizes, (m, 1))
     g = B @ rng.standard_normal(n) * 0.1 + np.abs(B).sum(axis=1) * 0.05
@@ -32,7 +28,6 @@ def program(seed: int, n: int = 6, m: int = 4, sizes: tuple[int, int] = (-4, 4))
 
 
 def pressed(seed: int) -> VariationalInequality:
-    """The program with a load that presses it against constraints."""
     vi = program(seed)
     return replace(vi, f=100.0 * vi.f)
 

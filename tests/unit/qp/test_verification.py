@@ -1,5 +1,3 @@
-"""Natural KKT residuals: what they are, what they do not depend on, and what they find."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import exact, spd
 
-from vibench.errors import NumericalError
-from vibench.interfaces.problem import VariationalInequality
+from vibench import NumericalError, Status, VariationalInequality
 from vibench.qp.solve import installed_solvers, solve_qp
-from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, infeasibility_certificate, kkt_residuals, verify
 
 seeds = st.integers(0, 10_000)

@@ -7,10 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import space
 
-from vibench.errors import NumericalError
-from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.strategies import DualStrategy, Stop
-from vibench.linalg.inner_product import InnerProduct
+from vibench import DualStrategy, HighFidelitySolver, InnerProduct, NumericalError, Stop
 from vibench.reduction import cones as cone_module
 from vibench.reduction import subtract_cone_component
 from vibench.reduction.cones import TIE, LazyMaximum, greedy_cone, orthogonality, project_on_cone, project_on_orthant

@@ -11,13 +11,9 @@ from hypothesis import strategies as st
 from numerics import Varying, space
 from scipy.optimize import nnls
 
-from vibench.arrays import Array
-from vibench.errors import NumericalError, RequestError
-from vibench.interfaces.problem import ContactLoads
-from vibench.interfaces.strategies import Offline, ReducedSet, Stop, no_free
+from vibench import Array, ContactLoads, NumericalError, Offline, ReducedSet, RequestError, Stop, Study, no_free, pod
 from vibench.reduction import Cubature, cubature
 from vibench.reduction.nested import NestedStrategy, Step, grow_through
-from vibench.reduction.pod import pod
 from vibench.reduction.supremizers import (
     ContactCoordinates,
     LoadCoordinates,
@@ -28,7 +24,6 @@ from vibench.reduction.supremizers import (
     supremizers,
 )
 from vibench.study.matrix import expand
-from vibench.study.spec import Study
 
 
 def test_a_supremizer_attains_its_own_norm() -> None:
@@ -115,7 +110,6 @@ seeds = st.integers(0, 10_000)
 
 
 def tail(snapshots: np.ndarray, basis: np.ndarray, X) -> float:
-    """Relative projection error of the definition (11)."""
     rest = snapshots - basis @ X.gram(basis, snapshots)
     return float(np.sqrt((X.norm(rest) ** 2).sum() / (X.norm(snapshots) ** 2).sum()))
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,7 +34,6 @@ def reported(quick_run: Path, shared: Shared) -> Path:
 
 @pytest.fixture(scope="module")
 def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the browser saves what it downloads."""
     return tmp_path_factory.mktemp("downloads")
 
 

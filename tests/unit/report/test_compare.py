@@ -1,7 +1,3 @@
-"""Two runs side by side: what got worse is found, and nothing else is."""
-
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -11,8 +7,8 @@ import pandas as pd
 import pytest
 from running import DECIDED, Changed, Main, execute, succeeded
 
+from vibench import RequestError
 from vibench.cli.result_commands import compare_runs
-from vibench.errors import RequestError
 from vibench.provenance import PROTOCOL
 from vibench.report.comparison import Comparison, compare
 from vibench.report.differences import ChangeKind, agreement, compared_runs
@@ -41,7 +37,6 @@ def quick_run(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 @pytest.fixture
 def steady(changed: Changed, tmp_path: Path) -> Path:
-    """A run with the same seconds in every round."""
     return changed(*STEADY).rename(tmp_path / "steady.sqlite")
 
 
@@ -182,10 +177,8 @@ def test_strict_fails(changed: Changed, steady: Path, quick_run: Path, capsys: p
     assert "0 for the worse" in capsys.readouterr().out
     compare_runs([str(quick_run), str(quick_run)], strict=True, form="csv")
     assert capsys.readouterr().out.startswith("run,against,problem,formulation,dual,primal,asked")
-    for runs, said in (
-        ([str(quick_run), "nowhere"], "no results in 'nowhere'"),
-        ([str(after)], "expected two or more"),
-    ):
+    wrong = ([str(quick_run), "nowhere"], "no results in 'nowhere'"), ([str(after)], "expected two or more")
+    for runs, said in wrong:
         with pytest.raises(RequestError, match=said):
             compare_runs(runs)
 
@@ -213,9 +206,7 @@ def test_what_many_runs_have_is_told_in_every_table_and_format(three: list[Path]
     assert list(runs["cells"]) == [12, 12, 6]
     assert set(runs["in all runs"]) == {6}
     assert list(runs["same code"]) == [12, 12, 6]
-    assert list(found.present[["steady", "server", "later"]].drop_duplicates().itertuples(index=False, name=None)) == [
-        ("yes", "yes", "no")
-    ]
+    assert found.present[["steady", "server", "later"]].drop_duplicates().to_numpy().tolist() == [["yes", "yes", "no"]]
     assert len(found.present) == 6
     values = found.values("online_s")
     assert len(values) == 12

@@ -1,7 +1,3 @@
-"""Figures: every one of a real run is drawn and shows the numbers of its results file."""
-
-from __future__ import annotations
-
 import html
 import json
 from collections.abc import Callable
@@ -21,24 +17,21 @@ from matplotlib.lines import Line2D
 from PIL import Image
 from running import DECIDED, Changed, Main, execute
 
-from vibench.errors import RequestError
-from vibench.report import figures
+from vibench import RequestError, read_study
+from vibench.report import figures, save, styled
 from vibench.report.figures import KINDS, answer_sheet, draw_all, effectivity, spaces
 from vibench.report.figures import problem_tables as of_file
 from vibench.report.figures.data import ProblemTables, _per_combination
-from vibench.report.figures.style import save, styled
 from vibench.report.html import page as report_page
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 from vibench.results.verdict import verdicts
-from vibench.study.matrix import read_study
 
 Drawn = dict[str, Figure]
 
 
 @pytest.fixture
 def results(changed: Changed) -> Path:
-    """A copy of the results of a real run, free to be changed."""
     return changed()
 
 
@@ -54,7 +47,6 @@ def tables(quick_run: Path) -> Tables:
 
 @pytest.fixture
 def change(results: Path) -> Change:
-    """Function that runs SQL on the copy."""
     return partial(execute, results.parent)
 
 
@@ -83,7 +75,6 @@ def drawn_from(results: Path, folder: Path, *kinds: str, rendered: bool = False)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the figures of the run as it is."""
     return tmp_path_factory.mktemp("drawn") / "figures"
 
 
@@ -101,7 +92,6 @@ def draw(results: Path, tmp_path: Path) -> Draw:
 
 
 def data_of(axes: Axes) -> list[np.ndarray]:
-    """The finite values of every line with data."""
     values = [np.asarray(line.get_ydata(), float) for line in axes.get_lines()]
     return [found[np.isfinite(found)] for found in values if np.isfinite(found).any()]
 
@@ -164,9 +154,8 @@ def test_every_figure_can_be_read(drawn: Drawn, folder: Path) -> None:
         named = {label for axes in figure.axes for label in axes.get_legend_handles_labels()[1]}
         # In the legend, or beside the ends of their lines.
         written = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
-        assert named <= written | {text.get_text().replace("\n", "") for axes in figure.axes for text in axes.texts}, (
-            name
-        )
+        written |= {text.get_text().replace("\n", "") for axes in figure.axes for text in axes.texts}
+        assert named <= written, name
         assert len([one for one in panels(figure) if name.endswith("answer")]) in (0, 4), name
         places = [tuple(np.round(axes.get_position().bounds[:2], 6)) for axes in panels(figure)]
         assert max(sum(place[1] == row for place in places) for row in {place[1] for place in places}) <= 3, name
@@ -211,10 +200,8 @@ def test_convergence_and_constants_are_those_of_histories_and_queries(drawn: Dra
     np.testing.assert_array_equal(places, range(1, len(expected) + 1))
     hertz = stability(drawn["hertz-answer"])
     assert hertz.get_xlabel() == "radius µ [m]"
-    np.testing.assert_array_equal(
-        line_called(hertz, "high-fidelity").get_xdata(),
-        np.sort(queries[queries["problem"] == "hertz"]["mu_1"].unique()),
-    )
+    radii = np.sort(queries[queries["problem"] == "hertz"]["mu_1"].unique())
+    np.testing.assert_array_equal(line_called(hertz, "high-fidelity").get_xdata(), radii)
     # β over the span of the decorrelated basis is zero in this run, which a logarithmic axis cannot show
     texts = [text.get_text() for text in stability(drawn["obstacle-answer"]).texts]
     assert "β = 0: decorrelated" in texts
@@ -222,11 +209,8 @@ def test_convergence_and_constants_are_those_of_histories_and_queries(drawn: Dra
 
 def test_a_logarithmic_panel_with_nothing_to_show_stays_empty(change: Change, draw: Draw) -> None:
     """A strategy that records no σ, and enrichments that leave β at zero."""
-    change(
-        ONE_PAIR,
-        "DELETE FROM histories WHERE quantity = 'sigma'",
-        "UPDATE histories SET value = 0.0 WHERE quantity = 'beta_span_min'",
-    )
+    change(ONE_PAIR, "DELETE FROM histories WHERE quantity = 'sigma'")
+    change("UPDATE histories SET value = 0.0 WHERE quantity = 'beta_span_min'")
     _, _, sigma, beta = draw("convergence")["obstacle-convergence"].axes
     assert not sigma.get_lines()
     for axes in (sigma, beta):
@@ -308,9 +292,7 @@ def test_a_panel_has_four_series_and_a_sentence_counts_the_others(count: int, ta
     assert f"{count - 4} other strategies are in the tables." in sheet.caption
 
 
-def test_the_tightest_enrichment_went_farthest_and_the_best_model_pays_where_lines_cross(
-    results: Path, change: Change
-) -> None:
+def test_the_tightest_enrichment_went_farthest_and_models_pay_where_lines_cross(results: Path, change: Change) -> None:
     """Whichever way its tolerance runs, and however many training parameters there are."""
     mine = dict(of_file(results))["obstacle"].histories
     steps = mine[(mine["quantity"] == "beta_span_min") & (mine["dual"] == "mcpg")]
@@ -323,13 +305,11 @@ def test_the_tightest_enrichment_went_farthest_and_the_best_model_pays_where_lin
     change(*DECIDED)
     data = dict(of_file(results))["obstacle"]
     figure = answer_sheet.answer(data)
-    assert figure is not None
     cost = next(axes for axes in figure.axes if axes.get_xlabel() == "number of queries")
     (mark,) = [line for line in cost.get_lines() if line.get_marker() in "<>"]
     ((n, total),) = mark.get_xydata()
-    through = [
-        np.interp(n, *np.asarray(line.get_xydata()).T) for line in cost.get_lines() if len(line.get_xydata()) > 1
-    ]
+    lines = (np.asarray(line.get_xydata()).T for line in cost.get_lines())
+    through = [np.interp(n, *xy) for xy in lines if xy.shape[1] > 1]
     assert sum(np.isclose(value, total, rtol=0.02) for value in through) >= 2
     row = data.thresholds[data.thresholds["benefit_threshold"] == n]
     (interval,) = cost.collections[0].get_paths()
@@ -337,9 +317,7 @@ def test_the_tightest_enrichment_went_farthest_and_the_best_model_pays_where_lin
     assert f"{n:.0f} queries" in [text.get_text() for text in cost.texts]
 
 
-def test_a_model_with_a_query_that_is_not_ok_has_no_point_and_others_their_errors(
-    change: Change, draw: Draw, results: Path
-) -> None:
+def test_a_model_with_a_query_not_ok_has_no_point_and_others_have(change: Change, draw: Draw, results: Path) -> None:
     """A strategy that solved the easy half of the queries has no smaller error for it."""
     cells = read_table(results, "cells")
     best = next(one.best for one in verdicts(cells, read_table(results, "thresholds")) if one.problem == "obstacle")
@@ -366,13 +344,9 @@ def test_bounds_are_drawn_against_the_errors_of_every_query_that_has_them(tables
 
 
 def errors_panel(figure: Figure) -> list[Line2D]:
-    """The points of an answer sheet, a line for every strategy."""
     panel = next(axes for axes in figure.axes if axes.get_xlabel() == "mean time of a query [ms]")
-    return [
-        line
-        for line in panel.get_lines()
-        if line.get_linestyle() == "None" and not str(line.get_label()).startswith("_")
-    ]
+    points = [line for line in panel.get_lines() if line.get_linestyle() == "None"]
+    return [line for line in points if not str(line.get_label()).startswith("_")]
 
 
 def test_without_contact_errors_of_u_are_drawn_alone(change: Change, draw: Draw) -> None:

@@ -1,5 +1,3 @@
-"""Findings: every sentence says what the tables say, and nothing is said that they do not support."""
-
 from collections.abc import Callable
 
 import pytest
@@ -17,7 +15,6 @@ def said(changed: Changed) -> Said:
 
 
 def only(texts: list[str], *words: str) -> str:
-    """The one text that has all of these words."""
     (text,) = (text for text in texts if all(word in text for word in words))
     return text
 

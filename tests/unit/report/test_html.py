@@ -1,7 +1,3 @@
-"""The report: whole, self-contained, and nothing in it is markup that somebody else wrote."""
-
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -14,7 +10,7 @@ from markupsafe import escape
 from outputs import Links, clean, elements
 from running import Changed, Main
 
-from vibench.library.runs import Run
+from vibench import Run
 from vibench.report import html
 from vibench.report.findings import findings
 from vibench.report.plots import short
@@ -29,7 +25,6 @@ FEW = "DELETE FROM cells WHERE problem = 'hertz' OR dual = 'cpg'"
 
 @pytest.fixture(scope="module")
 def made(reported: Path) -> Path:
-    """The report of a real run."""
     return reported / "report.html"
 
 
@@ -65,7 +60,6 @@ def test_numbers_of_the_page_are_those_of_other_tables_though_they_are_rounded_t
 
 
 def data(page: str, name: str) -> Any:
-    """The data that a page embeds."""
     return json.loads(page.split(f'id="{name}">')[1].split("</script>", maxsplit=1)[0])
 
 
@@ -85,9 +79,7 @@ def test_findings_tables_and_facts_are_in_it_and_first_rows_without_javascript(m
     assert {"problem", "solver"} <= {*break_even["axes"]}
     assert {"break-even", "interval"}.isdisjoint(break_even["axes"]), "results, not axes of the study"
     whole = {column["name"]: column for column in embedded["columns"]}
-    assert whole["error λ"]["numbers"] == [
-        pytest.approx(error, rel=1e-5) for error in in_order(cells)["error_lambda_mean"]
-    ]
+    assert whole["error λ"]["numbers"] == pytest.approx(in_order(cells)["error_lambda_mean"].tolist(), rel=1e-5)
     assert "None: every query of every cell is ok." in page
     (table,) = re.findall(r'data-table="summary"></div>\n<noscript>(.*?)</noscript>', page, re.DOTALL)
     assert table.count("<tr>") == 1 + min(len(cells), 50)

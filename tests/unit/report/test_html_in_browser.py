@@ -1,7 +1,3 @@
-"""The report in a real browser: what it shows at desktop and phone width, in light and dark, and what it does."""
-
-from __future__ import annotations
-
 import contextlib
 import csv
 import io
@@ -67,7 +63,6 @@ return texts;
 
 @pytest.fixture(scope="module")
 def made(reported: Path) -> Path:
-    """The report of a real run."""
     return reported / "report.html"
 
 
@@ -81,7 +76,6 @@ def awaited(browser: Chrome, condition: Callable[[Chrome], Any]) -> Any:
 
 
 def shown_rows(browser: Chrome, table: str = "summary") -> list[dict[str, str]]:
-    """The rows of a table as they are seen, by the headings."""
     read = """
     const table = document.querySelector(`[data-table="${arguments[0]}"] table`);
     const texts = row => [...row.cells].map(cell => cell.textContent);
@@ -92,7 +86,6 @@ def shown_rows(browser: Chrome, table: str = "summary") -> list[dict[str, str]]:
 
 
 def choose(browser: Chrome, axis: str, value: str) -> None:
-    """Choose a value in the list of an axis, as a user does."""
     labels = browser.find_elements(By.CSS_SELECTOR, '[data-table="summary"] .tools label')
     (label,) = [one for one in labels if one.text.split("\n")[0].split(" all")[0].strip() == axis]
     label.find_element(By.XPATH, f".//option[normalize-space(.)='{value}']").click()
@@ -119,9 +112,8 @@ def test_nothing_is_cut_or_wrapped_in_numbers(width: int, themes: tuple[str, str
         assert seen["cut"] == 0
         red = int(seen["paper"].split("(")[1].split(",")[0])
         assert red > 240 if theme == "light" else red < 40
-    pictures = browser.execute_script(
-        "return [...document.images].map(image => { image.loading = 'eager'; return image.alt.length; })"
-    )
+    eager = "return [...document.images].map(image => { image.loading = 'eager'; return image.alt.length; })"
+    pictures = browser.execute_script(eager)
     assert min(pictures) > 30
     awaited(browser, lambda b: b.execute_script("return [...document.images].every(image => image.naturalWidth > 100)"))
 
@@ -211,16 +203,14 @@ def test_the_csv_is_what_is_shown(browser: Chrome, made: Path, downloads: Path, 
     assert [plain.get(row["primal"], row["primal"]) for row in rows] == [row["primal"] for row in shown]
     assert f"'{FORMULA}" in text
     assert f",{FORMULA}" not in text
-    assert [float(row["error u"] or "nan") for row in rows] == pytest.approx(
-        [float(row["error u"] or "nan") for row in shown], rel=1e-2, nan_ok=True
-    )
+    written, seen = ([float(row["error u"] or "nan") for row in some] for some in (rows, shown))
+    assert written == pytest.approx(seen, rel=1e-2, nan_ok=True)
 
 
 INTO_VIEW = "document.getElementById(arguments[0]).scrollIntoView()"
 
 
 def move(browser: Chrome, *places: tuple[float, float]) -> None:
-    """Move the pointer from place to place."""
     actions = ActionChains(browser)
     for x, y in places:
         actions.w3c_actions.pointer_action.move_to_location(round(x), round(y))
@@ -348,9 +338,7 @@ return { cell: data.cell[0], lines: lines(views[0]).length, curves, hash: locati
 """
 
 
-def test_the_verdict_comes_first_and_plots_before_tables_say_which_model_for_how_many_queries(
-    browser: Chrome, made: Path
-) -> None:
+def test_the_verdict_comes_first_and_plots_say_which_model_for_how_many_queries(browser: Chrome, made: Path) -> None:
     """Points with the high-fidelity model as a line, total costs with bands; a selected point leads to its row."""
     look(browser, made)
     show_plot(browser, "hertz-overview")

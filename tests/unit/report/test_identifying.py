@@ -1,7 +1,5 @@
 """A published site tells neither in whose home nor on which host runs were made, and installs nothing of strangers."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from pathlib import Path

@@ -1,7 +1,3 @@
-"""Replay and export of the reduced programs of a run, through the command line and from Python."""
-
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -10,17 +6,21 @@ import numpy as np
 import pandas as pd
 import pytest
 import qpsolvers
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import spd
 from running import Vibench, run_of
 from typer.testing import CliRunner
 
 import vibench
+from vibench import RequestError, VariationalInequality
 from vibench.cli.main import app
-from vibench.errors import RequestError
 from vibench.execution.recorded_cell import RecordedCell, recorded_cell, recorded_cells
 from vibench.plugins import registry
-from vibench.qp import verification
+from vibench.qp import kkt_residuals, verification
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.report import replay
+from vibench.report.qps_checker import residuals
 
 STUDY = """
 name = "small"
@@ -142,3 +142,16 @@ def test_full_disks_leave_nothing(kib: int, arguments: list[str], run: Path, vib
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"vibench: '{target[arguments[0]][-1]}' cannot be written: File too large\n"
     assert list(tmp_path.iterdir()) == []
+
+
+@given(
+    seed=st.integers(0, 10_000), load=st.sampled_from([0.0, 1e-16, 1.0]), closed=st.sampled_from([0.0, 1.0]),
+    share=st.sampled_from([0.0, 1e-7, 1.0]), unit=st.integers(-9, 9),
+)  # fmt: skip
+def test_residuals_are_those_of_verification(seed: int, load: float, closed: float, share: float, unit: int) -> None:
+    """With a load, with one that is round-off, without; of solutions of any size, zero included."""
+    rng = np.random.default_rng(seed)
+    P, q, G = 10.0**unit * spd(5, rng), load * rng.standard_normal(5), rng.standard_normal((3, 5))
+    h, x, z = rng.random(3) - closed, share * rng.standard_normal(5), share * 10.0**unit * rng.random(3)
+    found = kkt_residuals(VariationalInequality(P, -q, G, h), x, z)
+    assert residuals(P, q, G, h, x, z, 0.0) == pytest.approx([found.primal, found.dual, found.gap], rel=1e-9, abs=1e-15)

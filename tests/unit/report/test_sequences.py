@@ -1,5 +1,3 @@
-"""Ordered validation sets from the study to a test set of qpbenchmark."""
-
 from __future__ import annotations
 
 import importlib
@@ -17,9 +15,8 @@ import qpsolvers
 from running import run_of
 from typer.testing import CliRunner
 
-from vibench import create, open_run
+from vibench import RequestError, create, open_run
 from vibench.cli.main import app
-from vibench.errors import RequestError
 from vibench.execution.recorded_cell import recorded_cells
 from vibench.report import replay
 from vibench.study.parameter_sets import ParameterSet

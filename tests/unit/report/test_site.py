@@ -1,7 +1,3 @@
-"""The site of some runs: whole, alive in a real browser, reproducible, and careful with files of others."""
-
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -17,7 +13,7 @@ from outputs import Links, clean, elements
 from running import Changed, Main, execute, refused, succeeded
 from selenium.webdriver import Chrome
 
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.report import html
 from vibench.report import site as folder
 from vibench.report.citation import Citation, requirements
@@ -155,9 +151,8 @@ def test_runs_have_data_commands(site: Path, three: list[Path], main: Main, monk
     assert f"numpy=={versions['numpy']}\n" in text
     assert {"piqp", "osqp", "proxsuite"} <= {line.split("==")[0] for line in text.splitlines()}
     evil = {"numpy": "1.0 --index-url http://x", "-r /etc/passwd": "1", "scipy": "1\n-e .", "piqp": "1.0, 2.0", "a": ""}
-    lines = requirements(
-        {**evil, "python": "3.12", "protocol": "1", "evil-package": "6.6.6"}, "code\n--pre"
-    ).splitlines()
+    evil |= {"python": "3.12", "protocol": "1", "evil-package": "6.6.6"}
+    lines = requirements(evil, "code\n--pre").splitlines()
     assert all(line.startswith("#") for line in lines)
     assert not any("evil" in line or "passwd" in line for line in lines)
     assert any(line.startswith("# left out: 3 that") for line in lines)
@@ -254,7 +249,6 @@ def test_a_label_is_no_markup(site: Path, changed: Changed, tmp_path: Path) -> N
 
 @pytest.fixture
 def small(three: list[Path], tmp_path: Path) -> Path:
-    """A site of one run."""
     return publish(three[:1], tmp_path / "small", CITATION).parent
 
 

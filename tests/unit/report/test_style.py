@@ -1,9 +1,5 @@
-"""The style of figures: labels are text of others and are drawn as they are."""
-
-from __future__ import annotations
-
 import io
-from itertools import combinations
+from itertools import combinations, product
 from xml.etree import ElementTree
 
 import matplotlib as mpl
@@ -16,19 +12,9 @@ from matplotlib.figure import Figure
 
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
+from vibench.report import Layout, Looks, Series, Sheet, plot, styled
 from vibench.report.figures.data import file_names
-from vibench.report.figures.style import (
-    COLOURS,
-    Layout,
-    Looks,
-    Series,
-    Sheet,
-    caption_of,
-    look_of,
-    plot,
-    styled,
-    write_figure,
-)
+from vibench.report.figures.style import COLOURS, caption_of, look_of, write_figure
 from vibench.text import printable
 
 SOLVERS = ("piqp", "proxqp", "osqp", "clarabel", "daqp", "quadprog", "highs", "scs", "cvxopt", "ecos")
@@ -93,9 +79,7 @@ NAMES = st.lists(st.text(max_size=12), min_size=1, max_size=10, unique=True)
 
 
 @given(NAMES, NAMES)
-def test_a_strategy_looks_the_same_in_every_figure_where_no_other_has_its_colour(
-    one: list[str], other: list[str]
-) -> None:
+def test_a_strategy_looks_the_same_where_no_other_has_its_colour(one: list[str], other: list[str]) -> None:
     """Whatever else a run compares, in whatever order, and at whatever tolerances."""
     alone, among = Looks([Series(one[0])]), Looks([Series(name, 0.5) for name in [*reversed(other), one[0]]])
     first, second = alone[Series(one[0])], among[Series(one[0], 0.5)]
@@ -122,9 +106,7 @@ def test_line_styles_mean_the_assembly() -> None:
 
 @given(NAMES, st.lists(st.floats(0.0, 1.0), max_size=6, unique=True))
 def test_no_two_series_of_a_figure_look_the_same(names: list[str], tolerances: list[float]) -> None:
-    series = [Series(name, variant, way) for name in names for variant in ("", *tolerances) for way in ("", "reduced")][
-        :10
-    ]
+    series = [Series(*one) for one in product(names, ("", *tolerances), ("", "reduced"))][:10]
     looks = Looks(series)
     assert len({looks[one] for one in series}) == len(series)
     lines = [looks[one].line(9) for one in series]

@@ -1,7 +1,3 @@
-"""What is said of a published site that somebody submits: nothing of a good one, a line for every altered file."""
-
-from __future__ import annotations
-
 import importlib
 import re
 import shutil

@@ -9,7 +9,6 @@ from vibench.results.database import ResultsDatabase
 
 @pytest.fixture
 def journal(tmp_path: Path) -> Iterator[ResultsDatabase]:
-    """The results of a new study."""
     made = ResultsDatabase(tmp_path / "run", RECORDED)
     yield made
     made.close()

@@ -1,6 +1,5 @@
-"""Benefit thresholds: the paper's, their four meanings, and which cells are compared."""
-
 from collections.abc import Callable, Iterable, Mapping
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -123,9 +122,7 @@ def test_enrichments_are_compared_with_the_high_fidelity_model_and_pairs_of_thei
     cells += [cell("f", "fixed", primal_tol=tolerance) for tolerance in (0.5, 0.1, 0.01)]
     rows = [row for row in compared(cells) if row["primal_a"] != "high-fidelity"]
     assert len(rows) == 2 * 3
-    assert {(row["primal_a"], row["primal_tol_b"]) for row in rows} == {
-        (name, tolerance) for name in ("v0", "v1") for tolerance in (0.5, 0.1, 0.01)
-    }
+    assert {(row["primal_a"], row["primal_tol_b"]) for row in rows} == {*product(("v0", "v1"), (0.5, 0.1, 0.01))}
     fixed, unanswered = cell("fixed", "fixed"), [cell("varying", "per-parameter", online_s=None)]
     assert pairs(compared([*unanswered, fixed, cell("fixed", "fixed", online_s=None)])) == [("high-fidelity", "fixed")]
     assert compared([]) == []
@@ -207,7 +204,6 @@ def test_a_formulation_is_compared_over_the_axes_that_it_lacks(axis: str) -> Non
 
 
 def the_one(cells: list[dict[str, Any]], timings: list[dict[str, Any]]) -> dict[str, Any]:
-    """The comparison of the two cells with each other."""
     (row,) = [row for row in break_even_rows(cells, timings) if row["primal_a"] != "high-fidelity"]
     return row
 

@@ -1,5 +1,3 @@
-"""Inequalities that recorded constants and bounds satisfy, and solvers that agree or are flagged."""
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,9 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import spd
 
-from vibench.interfaces.problem import VariationalInequality
+from vibench import VariationalInequality, solve_qp
 from vibench.qp import verification
-from vibench.qp.solve import solve_qp
 from vibench.qp.verification import Slack, allowed, slack
 from vibench.results import consistency
 from vibench.results.consistency import Recorded, compare, disagreement_rows, solution_row, violations
@@ -25,7 +22,6 @@ def program(seed: int, n: int = 6, m: int = 4) -> VariationalInequality:
 
 
 def random_answer(vi: VariationalInequality, rng: np.random.Generator, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """The solution, moved by about `size`."""
     exact = solve_qp(vi, "piqp", 1e-12)
     x = exact.x * (1.0 + size * rng.standard_normal(len(vi.f)))
     return x, np.maximum(exact.alpha * (1.0 + size * rng.standard_normal(len(vi.g))), 0.0)

@@ -1,5 +1,3 @@
-"""The results file: one transaction a cell, no mixture of studies; locked, removed, replaced, damaged or read-only."""
-
 import contextlib
 import hashlib
 import json

@@ -1,5 +1,3 @@
-"""Models compared by the error of a quantity of interest: break-even, the fastest cells and the figure of both."""
-
 import re
 from pathlib import Path
 from typing import Any
@@ -11,8 +9,7 @@ from running import Main, refused, succeeded
 from samples import cell_row
 
 import vibench
-from vibench.errors import RequestError
-from vibench.interfaces.strategies import Kind
+from vibench import Kind, RequestError
 from vibench.results.break_even import break_even_rows
 from vibench.results.database import FILE, ResultsDatabase
 from vibench.results.ranking import errors_of, fastest, measures, with_errors, within

@@ -19,8 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import cells_of, row_of
 
-from vibench import open_run
-from vibench.errors import RequestError
+from vibench import RequestError, open_run
 from vibench.results import formats, ranking
 from vibench.results.paired_timing import PairedTiming
 from vibench.results.ranking import Criterion, Standings, cheapest, fastest, leaderboard
@@ -40,7 +39,6 @@ def test_the_fastest_query_wins_its_band_or_the_high_fidelity_model_which_paces_
     (found,) = leaderboard(cells_of(row_of("a", 0.05, 0.4, hf_s=0.5), row_of("b", 1e-3, 0.6, hf_s=0.5)))
     assert won(found, Criterion.QUERY) == [(0.1, "a"), (1e-3, "")]
     winner = found.bands[-1].winner(Criterion.QUERY)
-    assert winner is not None
     assert (winner.cell["primal"], winner.value) == ("high-fidelity", pytest.approx(0.5))
     (found,) = leaderboard(cells_of(row_of("a", 0.05, 0.3, hf_s=1.0), row_of("b", 0.05, 0.2, hf_s=0.5)))
     assert won(found, Criterion.QUERY) == [(0.1, "a")]
@@ -90,7 +88,6 @@ def test_differences_within_their_interval_or_the_work_of_solvers_are_ties() -> 
     rows = [row_of(name, error, 0.1, **parts) for name, error in (("a", 1.001e-2), ("b", 1e-2), ("c", 1.1e-2))]
     (found,) = leaderboard(cells_of(*rows))
     winner = found.bands[0].winner(Criterion.ERROR)
-    assert winner is not None
     assert (winner.cell["cell"], winner.ties) == ("b", ("a",))
 
 
@@ -100,17 +97,13 @@ some = st.floats(1e-6, 0.49)
 
 @given(st.lists(st.tuples(some, some, some, st.sampled_from([0.0, 0.3])), min_size=1, max_size=8))
 def test_nobody_in_a_band_is_better_than_its_winner(found: list[tuple[float, float, float, float]]) -> None:
-    rows = [
-        row_of(str(k), error, online, offline_s=offline, beta_span_min=beta)
-        for k, (error, online, offline, beta) in enumerate(found)
-    ]
+    rows = [row_of(str(k), *one[:2], offline_s=one[2], beta_span_min=one[3]) for k, one in enumerate(found)]
     (standings,) = leaderboard(cells_of(*rows))
     for band in standings.bands:
         mine = [one for one in found if one[0] <= band.error * (1 + 1e-12)]
         assert len(mine) == band.cells
         for criterion, place in ((Criterion.ERROR, 0), (Criterion.QUERY, 1), (Criterion.OFFLINE, 2)):
             winner = band.winner(criterion)
-            assert winner is not None
             assert winner.value == pytest.approx(min(one[place] for one in mine))
             assert found[int(winner.cell["cell"])][place] == winner.value
         assert band.error <= ranking.LARGEST_BAND * (1 + 1e-12)
@@ -181,10 +174,8 @@ def test_the_winners_of_the_leaderboard_are_those_of_the_raw_rows(raw: Raw, fold
             assert len(within) == band.cells
             best = max(within, key=lambda cell: raw.gain(cell["cell"]))
             winner = band.winner(Criterion.QUERY)
-            assert winner is not None
             assert winner.cell["cell"] == (best["cell"] if raw.gain(best["cell"]) >= 1.0 else "")
             offline = band.winner(Criterion.OFFLINE)
-            assert offline is not None
             assert offline.value == min(cell["offline_s"] for cell in within)
             # the same model with another solver has the same offline seconds: no solver wins them
             models = {cell["cell"] for cell in within if cell["model"] == offline.cell["model"]}

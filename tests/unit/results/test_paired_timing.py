@@ -65,7 +65,6 @@ def measured(
 
 
 def covered(found: MeanEstimate | None, true: float) -> bool:
-    assert found is not None
     low, high = found.interval(TAIL)
     return low <= true <= high
 
@@ -101,7 +100,6 @@ def test_intervals_of_cells_whose_rounds_end_when_they_are_decided_contain_the_t
             paired = PairedTiming(kept)
             for cell in tuple(going):
                 found = paired.ratio(None, cell)
-                assert found is not None
                 low, high = found.interval(0.005)
                 going -= {cell} if low > 0.0 or high < 0.0 else set()
             kept += [row for row in rows if row["block"].endswith(f"/{block}") and row["cell"] in going]
@@ -164,16 +162,12 @@ def test_blocks_have_medians_at_the_pace_of_their_rounds_which_nobody_alone_make
 
 def test_without_other_models_an_interval_is_students_and_other_runs_differ_by_their_conditions() -> None:
     values = [0.1, 0.3, 0.2]
-    rows = [
-        {"cell": "c", "block": str(k), "total_s": np.exp(value), "hf_s": 1.0, "pace": 1.0}
-        for k, value in enumerate(values)
-    ]
+    one = {"cell": "c", "hf_s": 1.0, "pace": 1.0}
+    rows = [one | {"block": str(k), "total_s": np.exp(value)} for k, value in enumerate(values)]
     paired = PairedTiming(rows)
     found, of_other_runs = paired.ratio_within(None, "c"), paired.ratio(None, "c")
-    assert found is not None
     width = stdtrit(2, 0.975) * 0.1 / np.sqrt(3.0)
     assert found.interval(TAIL) == pytest.approx((0.2 - width, 0.2 + width))
-    assert of_other_runs is not None
     assert of_other_runs.error == pytest.approx(np.hypot(found.error, CONDITIONS))
 
 

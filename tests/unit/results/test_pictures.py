@@ -1,5 +1,3 @@
-"""Pictures: of the right solutions, the same when read back, and a reason where there is none."""
-
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -8,8 +6,7 @@ import numpy as np
 import pytest
 from samples import SampleStore, carry_out
 
-from vibench.errors import RequestError
-from vibench.interfaces.outputs import Picture
+from vibench import Picture, RequestError
 from vibench.plugins.plugin import Plugin
 from vibench.results import pictures
 from vibench.results.database import ResultsDatabase
@@ -48,7 +45,6 @@ def test_solutions_at_corners_and_middle_are_read(drawn: tuple[tuple[str, Pictur
     keys = [(("membrane", OBSTACLE.options), title, "") for title, _ in drawn]
     assert [(one.key, one.title, one.reason) for one in found] == keys
     for one, (_, picture) in zip(found, drawn, strict=True):
-        assert one.picture is not None
         assert (one.picture.name, one.picture.multiplier_name) == (picture.name, picture.multiplier_name)
         assert np.array_equal(one.picture.triangles, picture.triangles)
         for name in ("points", "values", "positions", "multiplier"):

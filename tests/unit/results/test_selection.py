@@ -1,5 +1,3 @@
-"""What `--where`, `--sort` and short keys select, and what a condition may not do."""
-
 import contextlib
 import hashlib
 import sqlite3
@@ -10,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.results.selection import matching, parts, short_keys, sorted_by
 
 FRAME = pd.DataFrame(columns=["cell", "solver", "N", "beta_span_min"])

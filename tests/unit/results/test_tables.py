@@ -1,5 +1,3 @@
-"""Tables: found, read, put in order, written, and printed for reading, with the names of parameters."""
-
 import csv
 import dataclasses
 import io
@@ -19,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import QUICK_ROUNDS, cell_row, query_rows
 
-from vibench.errors import RequestError
+from vibench import RequestError
 from vibench.results import read, show, sqlite
 from vibench.results.break_even import break_even_rows
 from vibench.results.database import ResultsDatabase

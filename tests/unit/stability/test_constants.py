@@ -6,10 +6,8 @@ import scipy.linalg
 import scipy.sparse as sp
 from numerics import Varying, space, spd
 
-from vibench.errors import NumericalError
+from vibench import InnerProduct, NumericalError, VariationalInequality
 from vibench.highfidelity.kkt_systems import CondensedStiffness
-from vibench.interfaces.problem import VariationalInequality
-from vibench.linalg.inner_product import InnerProduct
 from vibench.linalg.schur_complement import EliminationPattern
 from vibench.stability import coercivity, contact_infsup
 from vibench.stability.coercivity import (
@@ -206,9 +204,7 @@ def test_a_known_inverse_proves_it_from_the_compliance_alone(angle: float) -> No
     assert contact.of_inverse(B, B @ np.asarray(B @ (1.01 * accurate)).T, W).value <= exact
 
 
-def test_too_large_estimates_or_too_soft_complements_cost_sharpness_or_proof(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_too_large_estimates_or_too_soft_complements_cost_sharpness_or_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ŝ of a matrix P with A ≼ P / (1 − δ/σ), here exactly so: without δ/σ more than β_A would be proved."""
     vi, W, exact = varying(40)
     for lost in (1e-2, 0.4):

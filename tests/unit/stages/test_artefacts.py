@@ -19,9 +19,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from vibench import InnerProduct
 from vibench.errors import NumericalError, RequestError, StorageError
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.supremizers import ContactCoordinates
 from vibench.stages import artefacts as module
 from vibench.stages import assembly  # noqa: F401  lists what operators consist of
@@ -62,7 +62,6 @@ def test_what_is_put_is_got_by_another_process(tmp_path: Path, monkeypatch: pyte
     Store(folder).put("key", np.arange(3.0), TIME, (HISTORY,))
     monkeypatch.setattr(module, "machine", lambda: "here")
     found = reader.get("key")
-    assert found is not None
     np.testing.assert_array_equal(found.value, [0.0, 1.0, 2.0])
     assert (found.seconds, found.histories, found.machine) == (TIME, (HISTORY,), "there")
     assert files(folder) == ["key.artefact"]
@@ -99,7 +98,6 @@ def test_artefacts_are_whole_or_earlier_ones_stay(tmp_path: Path, monkeypatch: p
     with pytest.raises(StorageError, match=f"artefacts cannot be written to '{tmp_path}': No space left on device"):
         Store(tmp_path).put("key", 2, TIME, ())
     found = Store(tmp_path).get("key")
-    assert found is not None
     assert found.value == 1
     assert files(tmp_path) == ["key.artefact"]
     # A process that dies while it writes leaves no file under the key.
@@ -155,7 +153,6 @@ def test_artefacts_are_kept_up_to_so_many_bytes_and_those_used_long_ago_go_first
     assert store.get("one") is first
     assert store.get("two") is not second
     large = store.get("large")
-    assert large is not None
     assert len(large.value) == 4000
     assert store.get("large") is not large
 
@@ -295,14 +292,12 @@ class Stranger:
 
 
 def crafted(structure: str | bytes, **arrays: Any) -> bytes:
-    """What a stranger may write."""
     text = structure.encode() if isinstance(structure, str) else structure
     found = {"structure": np.frombuffer(text, np.uint8)} if text else {}
     return safetensors.numpy.save(found | {name: np.asarray(value) for name, value in arrays.items()})
 
 
 def header(text: str, data: bytes = b"") -> bytes:
-    """A safetensors file with this header."""
     return struct.pack("<Q", len(text)) + text.encode() + data
 
 

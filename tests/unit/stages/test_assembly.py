@@ -8,9 +8,7 @@ import pytest
 from running import Register
 from samples import SampleStore, mixed_cell, store_of
 
-from vibench.interfaces.problem import MEMBERS
-from vibench.interfaces.strategies import Stop
-from vibench.interfaces.validation import checked_assembly
+from vibench import MEMBERS, Stop, checked_assembly
 from vibench.model.affine import Evaluation
 from vibench.model.galerkin import ReducedModel, project
 from vibench.model.hyperreduced import HyperReducedModel
@@ -64,29 +62,10 @@ def wire_store(register: Register, tmp_path: Path) -> SampleStore:
 
 
 def wire(interpolation: float | None, problem: Plugin = WIRE) -> CellQueries:
-    """A cell of few modes and generators."""
     found = cell(problem, "decorrelated", interpolation)
     pod, cone = PODStage(problem, Stop(tolerance=1e-2)), replace(found.built.enrichment.cone, stop=Stop(tolerance=1e-2))
     enrichment = replace(found.built.enrichment, pod=pod, cone=cone)
     return replace(found, built=replace(found.built, enrichment=enrichment, pod=enrichment.pod, cone=enrichment.cone))
-
-
-@pytest.mark.long
-def test_rows_of_an_interpolated_problem(store: SampleStore) -> None:
-    rows = value_of(store, CELLS["obstacle"])
-    members = value_of(store, CELLS["obstacle"].built.reduction.decomposition)
-    assert (rows.cell["status"], rows.cell["interpolation_tol"]) == ("ok", TOLERANCE)
-    assert {name: rows.cell[f"terms_{name}"] for name in "fBg"} == {"f": 7, "B": 1, "g": 1}
-    assert rows.cell["terms_A"] == len(members["A"].rows) > 20
-    assert rows.cell["interpolation_error"] == members["A"].error == max(m.error for m in members.values())
-    assert 0.0 < rows.cell["interpolation_error"] <= TOLERANCE
-    assert 0.0 < rows.cell["assembly_error_u_max"] < 1e-5
-    assert rows.cell["assembly_share_max"] < 0.01
-    errors = [row["assembly_error"] for row in rows.queries]
-    assert rows.cell["assembly_error_max"] == max(errors)
-    assert 0.0 < min(errors) < max(errors) < 1e-3
-    assert {row["form"] for row in rows.queries} == {"primal"}
-    assert rows.cell["fallbacks"] == ""
 
 
 def test_what_interpolation_misses_or_nothing_declares_is_measured_and_told(wire_store: SampleStore) -> None:

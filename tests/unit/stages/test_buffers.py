@@ -11,8 +11,7 @@ from numerics import Varying
 from running import without_seconds
 from samples import SampleStore, carry_out, mixed_cell
 
-from vibench.interfaces.problem import Problem
-from vibench.interfaces.strategies import Stop
+from vibench import Problem, Stop
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find

@@ -1,5 +1,3 @@
-"""Queries that start from the solution before them on a path through the parameters."""
-
 from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
@@ -10,9 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import SampleStore, carry_out, mixed_cell
 
-from vibench.interfaces.parameters import ParameterBox
-from vibench.interfaces.problem import VariationalInequality
-from vibench.interfaces.strategies import Stop
+from vibench import ParameterBox, Stop, VariationalInequality
 from vibench.offline.assemblies import Assemblies
 from vibench.plugins.plugin import Plugin
 from vibench.qp import verification

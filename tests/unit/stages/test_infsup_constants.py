@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from samples import SampleStore, mixed_cell, store_of
 
-from vibench.interfaces.strategies import Stop
+from vibench import Stop
 from vibench.plugins.plugin import Plugin
 from vibench.stability.infsup import InfSup, inf_sup_full, inf_sup_on
 from vibench.stages.base import value_of
@@ -33,7 +33,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
 
 
 def constants(store: SampleStore, problem: str, primal: str) -> list[list[InfSup]]:
-    """Own, full and plain constants at every parameter."""
     return [value_of(store, stage) for stage in cell(problem, primal).constants]
 
 

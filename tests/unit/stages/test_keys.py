@@ -11,8 +11,8 @@ from types import CodeType, FrameType
 import pytest
 from samples import SampleStore, small_study
 
-from vibench import provenance
-from vibench.calibration.metropolis import Metropolis
+from vibench import Study, provenance
+from vibench.calibration import Metropolis
 from vibench.offline.assemblies import assemblies
 from vibench.plugins import registry
 from vibench.stages import timing_rounds
@@ -24,7 +24,6 @@ from vibench.stages.pictures import PictureStage
 from vibench.stages.snapshots import fingerprint_here
 from vibench.stages.timing_rounds import OfflineRepeat, TimingRounds
 from vibench.study.matrix import expand
-from vibench.study.spec import Study
 
 CORE = Path(provenance.__file__).parent
 

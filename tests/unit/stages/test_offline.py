@@ -10,14 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import SampleStore, carry_out, mixed_cell, store_of
 
-from vibench import timing
-from vibench.arrays import Array
-from vibench.errors import NumericalError
+from vibench import Array, Kind, NumericalError, Problem, Status, Stop, VariationalInequality, timing
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
-from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.interfaces.strategies import Kind, Stop
 from vibench.plugins.plugin import Plugin
-from vibench.qp.status import Status
 from vibench.reduction.nested import Milestone
 from vibench.stability.coercivity import Stability
 from vibench.stages import snapshots

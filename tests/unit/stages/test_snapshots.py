@@ -1,5 +1,3 @@
-"""Wrong models are named by the high-fidelity sweep of a run, and by all that reads what another process computed."""
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -44,7 +42,6 @@ VALIDATION = ParameterSet("validation", 8, 3)
 
 
 def swept(name: str, folder: Path) -> None:
-    """The training set solved and gathered."""
     build_problem.cache_clear()
     fingerprint_here.cache_clear()
     store = Store(folder / "artefacts")

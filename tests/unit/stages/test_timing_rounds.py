@@ -1,5 +1,3 @@
-"""Rounds of timing: what is timed in which order, and what becomes of it."""
-
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
@@ -10,16 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import SampleStore, mixed_cell, store_of
 
-from vibench.errors import NumericalError
-from vibench.interfaces.problem import MEMBERS, VariationalInequality
-from vibench.interfaces.strategies import Stop
+from vibench import MEMBERS, NumericalError, QPSolution, Status, Stop, VariationalInequality, solve_qp
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.plugins import registry
 from vibench.plugins.plugin import Plugin
-from vibench.qp.solve import solve_qp
-from vibench.qp.status import Status
-from vibench.qp.verification import QPSolution
 from vibench.stages import marginal_solutions, timing_rounds
 from vibench.stages.base import Failed
 from vibench.stages.cell_queries import CellQueries
@@ -57,7 +50,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
 
 
 def as_rows(*rounds: TimedRound, hf: float | None = 4.0, pace: float = 1.0, per_block: int = 4) -> list[dict[str, Any]]:
-    """Rows of the timings table of a cell."""
     return [
         {"block": str(k // per_block), "round": k, "queries": len(one.solve), "slowdown": one.slowdown}
         | {"hf_s": hf, "pace": pace}
@@ -98,7 +90,6 @@ def test_rounds_visit_cells_in_other_orders_and_a_slow_machine_meets_all_alike()
 
 
 def _in(stage: TimingRounds) -> timing_rounds._Rounds:
-    """Rounds in progress, without the models."""
     rounds = object.__new__(timing_rounds._Rounds)
     rounds._stage = stage
     return rounds
@@ -187,7 +178,6 @@ def test_solutions_come_amid_queries_until_enough_or_serve_all_cells(taken: floa
         list(beside.alternated(queries, done, 0, 0))
     assert [one.seconds is None for one in done] == [False, True, False]
     mean = beside.seconds(done, (1, 2, 3))
-    assert mean is not None
     assert mean.cpu == pytest.approx(0.02 * (11.0 / 3.0) / 4.0)  # the right ones are at parameters 1 and 3
     assert beside.seconds([done[1]], (1, 2, 3)) is None
 

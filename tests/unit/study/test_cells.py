@@ -1,5 +1,5 @@
-"""The matrix of a study: how many cells, which ones, and what identifies them."""
-
+import json
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
@@ -8,16 +8,19 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from running import Register
+from running import Changed, Main, Register, refused, succeeded
 from samples import REMOVE, STUDY, changed, write_study
 
-from vibench.errors import RequestError
-from vibench.interfaces.strategies import Stop
+from vibench import RequestError, Stop
+from vibench.execution.recorded_cell import recorded_study
 from vibench.plugins import registry
 from vibench.plugins.plugin import Plugin
+from vibench.results import formats
+from vibench.results.read import read_table
+from vibench.results.sqlite import FILE
 from vibench.study import cells as module
 from vibench.study.cells import Cell, digest
-from vibench.study.matrix import expand, read_study
+from vibench.study.matrix import expand, read_study, study_of_cell
 from vibench.study.parameter_sets import ParameterSet
 
 Expand = Callable[[Mapping[str, Any]], list[Cell]]
@@ -25,7 +28,6 @@ Expand = Callable[[Mapping[str, Any]], list[Cell]]
 
 @pytest.fixture
 def cells_of(tmp_path: Path) -> Expand:
-    """Function that gives the cells of a study's content."""
     return lambda content: expand(read_study(write_study(tmp_path, content)))
 
 
@@ -216,3 +218,43 @@ def test_a_digest_does_not_depend_on_the_order_of_keys(content: dict[str, Any]) 
 def test_digests_tell_contents_apart() -> None:
     contents = [None, "", [], {}, 0, 1, "1", [1], {"1": 1}, {"1": "1"}]
     assert len({digest(content) for content in contents}) == len(contents)
+
+
+@pytest.mark.parametrize("name", ["quick", "benefit", "hertz-quadrature", "paper-hertz"])
+def test_a_study_of_one_cell_has_the_same_cell(name: str) -> None:
+    """With prescribed sizes, tolerances by strategy, options, labels and reduced assembly."""
+    cells = expand(read_study(name))
+    for cell in (*cells[:4], *cells[-4:], *cells[:: max(len(cells) // 8, 1)]):
+        (again,) = expand(study_of_cell(cell, name))
+        assert (again.key, str(again), again.code) == (cell.key, str(cell), cell.code)
+
+
+def test_a_row_is_made_again_from_its_results_file_or_an_older_definition(quick_run: Path, main: Main) -> None:
+    named = str(quick_run.with_suffix(".toml"))
+    cell = expand(read_study(named))[0]
+    older = json.loads(cell.definition)
+    for name in ("training", "validation_sampling", "set_labels", "formulation", "formulation_label", "bounds"):
+        del older[name]
+    assert Cell.from_definition(json.dumps(older)) == cell
+    certified = Cell.from_definition(json.dumps(older | {"assembly": "certified"}))
+    assert (certified.assembly, certified.bounds) == ("reduced", True)
+    row = read_table(quick_run / FILE, "cells").iloc[3]
+    study = recorded_study(str(quick_run / FILE), row["cell"][:6])
+    assert [cell.key for cell in expand(study)] == [row["cell"]]
+    assert (study.name, study.timing_rounds) == ("quick", row["timing_rounds"])
+    for source, key in ((str(quick_run / FILE), row["cell"][:6]), (named, row["cell"])):
+        out = succeeded(main("run", source, "--cell", key, "--dry-run"))
+        assert out == f"{row['cell']}  {formats.name_of_cell(row)}\n1 cells\n"
+
+
+def test_a_cell_is_found_by_its_beginning_or_refused(quick_run: Path, changed: Changed, main: Main) -> None:
+    results = str(quick_run / FILE)
+    refused(main("run", results, "--cell", "xyz"), "0 cells", "begin with 'xyz'", "expected one")
+    refused(main("run", "quick", "--cell", "xyz"), "0 cells of 'quick' begin", "`vibench run quick --dry-run` lists")
+    ((digit, count),) = Counter(cell.key[0] for cell in expand(read_study("quick"))).most_common(1)
+    refused(main("run", "quick", "--cell", digit, "--dry-run"), f"{count} cells of 'quick' begin with '{digit}'")
+    refused(main("run", results, "--cell", "a", "--solver", "piqp"), "leave out solvers")
+    for definition in ("", "[]", "{}", '{"problem": 3}'):
+        broken = changed(f"UPDATE cells SET definition = '{definition}'")
+        key = read_table(broken, "cells")["cell"].iloc[0]
+        refused(main("run", str(broken), "--cell", key), key, "cannot be read")

@@ -1,15 +1,11 @@
-"""Who factorises is chosen by a study, part of the identity of its problem, and changes no number."""
-
 from unittest import mock
 
 import numpy as np
 import pytest
 
-from vibench import create
-from vibench.errors import RequestError
+from vibench import HighFidelitySolver, RequestError, Study, create
 from vibench.execution.run import unavailable
 from vibench.highfidelity import kkt_systems
-from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.linalg import factorisations, inner_product
 from vibench.linalg.factorisations import IMPLEMENTATIONS
 from vibench.plugins.kinds import PluginKind
@@ -17,7 +13,6 @@ from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
 from vibench.reduction import supremizers
 from vibench.study.matrix import expand
-from vibench.study.spec import Study
 
 STUDY = {
     "name": "s", "validation": 2, "solvers": ["piqp"], "dual": ["mcpg"], "primal": ["decorrelated"],

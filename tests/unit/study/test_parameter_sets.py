@@ -1,5 +1,3 @@
-"""Training and validation sets in study files: what a cell gets, and one line for what cannot be."""
-
 import json
 import os
 from collections.abc import Mapping
@@ -11,8 +9,7 @@ import pytest
 from packs import Cable, manifest, write_cable, write_manifest
 from samples import STUDY, changed, write_study
 
-from vibench.errors import RequestError
-from vibench.interfaces.parameters import ParameterBox
+from vibench import ParameterBox, RequestError
 from vibench.plugins.plugin import Plugin
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, read_study, study_of_cell

@@ -1,5 +1,3 @@
-"""Conformance checks of the plugins that come with vibench, their rules, the search for jumps, and the command."""
-
 import importlib.metadata
 from collections.abc import Iterator
 from dataclasses import replace
@@ -24,25 +22,10 @@ from vibench.testing import solvers
 from vibench.testing.case import difference, find_jump
 from vibench.testing.checks import Check, Doubt, Note, Verdict
 
-SLOW = dict.fromkeys(
-    (
-        "bearing",
-        "bulge",
-        "compiled",
-        "enlarged-cpg",
-        "greedy",
-        "hertz",
-        "hertz3d",
-        "hyper-reduced",
-        "infsup-greedy",
-        "nmf",
-        "obstacle",
-        "regression",
-        "tresca",
-        "two-spheres",
-    ),
-    pytest.mark.long,
-)
+SLOW = dict.fromkeys((
+    "bearing", "bulge", "compiled", "enlarged-cpg", "greedy", "hertz", "hertz3d", "hyper-reduced", "infsup-greedy",
+    "nmf", "obstacle", "regression", "tresca", "two-spheres",
+), pytest.mark.long)  # fmt: skip
 
 BUILT_IN = [
     pytest.param(word, entry.name, marks=SLOW.get(entry.name, ()))
@@ -52,7 +35,6 @@ BUILT_IN = [
 
 
 def unlisted(folder: Path) -> Path:
-    """A pack whose validation parameters are drawn in the box."""
     write_manifest(write_cable(folder), manifest({"parameters.validation": ...}))
     return folder
 
@@ -79,13 +61,10 @@ def test_a_built_in_plugin_passes_every_check(word: str, name: str, tmp_path: Pa
 def sampling_options(name: str, folder: Path) -> dict[str, object]:
     (folder / "points.csv").write_text("height,position\n0.5,-1\n900,2\n")
     return {
-        "grid": {"counts": [3]},
-        "list": {"points": [0.5, 2.0]},
-        "file": {"path": str(folder / "points.csv")},
-        "greedy": {"candidates": 64, "tolerance": 0.2},
-        "sweep": {"size": 7},
+        "grid": {"counts": [3]}, "list": {"points": [0.5, 2.0]}, "file": {"path": str(folder / "points.csv")},
+        "greedy": {"candidates": 64, "tolerance": 0.2}, "sweep": {"size": 7},
         "load-steps": {"parameter": "height", "loadings": 3, "steps": 4, "seed": 3},
-    }.get(name, {"size": 7, "seed": 3, "log": []})
+    }.get(name, {"size": 7, "seed": 3, "log": []})  # fmt: skip
 
 
 @pytest.mark.parametrize(

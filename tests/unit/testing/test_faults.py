@@ -1,5 +1,3 @@
-"""Every fault of a plugin is found by the check made for it; plugins that are right pass."""
-
 from collections.abc import Mapping
 from functools import partial
 from importlib import import_module
@@ -140,7 +138,6 @@ FAULTS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
 
 
 def messages(plugin: object) -> dict[str, str]:
-    """The messages of the checks that fail, or warn, by their names."""
     results = testing.examine(plugin)
     return {each.check: each.message for each in results if each.verdict in (Verdict.FAILED, Verdict.WARNING)}
 

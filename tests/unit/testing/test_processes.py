@@ -1,5 +1,3 @@
-"""Checks in other processes: those that hang or die are told; another process has other hashes; tests of pytest."""
-
 import os
 import subprocess
 import sys

@@ -1,5 +1,3 @@
-"""Sampling strategies that are wrong, each in one way: the check made for it finds it, and no other does."""
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import repeat
@@ -24,7 +22,6 @@ class Uniform(Sampling):
 
 
 def variant(name: str, base: type[Sampling] = Uniform, **methods: Callable[..., Any]) -> type[Sampling]:
-    """A strategy of this module with other methods."""
     return type(name, (base,), {**methods, "__module__": __name__, "__doc__": name})
 
 

@@ -12,14 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import exact, space, spd
 
-from vibench import RAYS, create
-from vibench.errors import UnsupportedError
-from vibench.interfaces.affine import AffineSum
-from vibench.interfaces.affine_problem import AffineProblem
-from vibench.interfaces.parameters import ParameterBox
+from vibench import RAYS, AffineProblem, AffineSum, InnerProduct, ParameterBox, UnsupportedError, create
 from vibench.interfaces.problem import Contact, Problem, Sampler, VariationalInequality
 from vibench.interfaces.strategies import Enrichment, Kind
-from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import affine_decomposition
 from vibench.model.bound_terms import BoundNote, CorrectionMode
 from vibench.model.certificates import contact_correction
@@ -121,7 +116,6 @@ Prepared = tuple[Any, HyperReducedModel, OnlineCertificate]
 
 
 def certified(problem: Problem, basis: Any, chi: Any, tolerance: float = 1e-3, eta: Any = None) -> Prepared:
-    """A model of a problem with its certificate."""
     training = problem.training_set()
     members = affine_decomposition(problem, training, tolerance)
     enrichment = Enrichment(Kind.NONE) if eta is None else Enrichment(Kind.PER_PARAMETER, eta=eta)
@@ -214,7 +208,7 @@ def test_no_error_is_above_its_bound(kind: tuple[str, bool, str], seed: int, siz
 
 
 @pytest.mark.parametrize("kind", TIED)
-def test_what_equalities_may_miss_enters_where_the_derivation_says(
+def test_what_equalities_miss_is_where_the_proof_says(
     kind: tuple[str, bool, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A larger η, with all else as it is, shows in the bound of λ_N and in those of the corrected pair."""
@@ -279,7 +273,7 @@ def test_the_residual_of_a_corrected_pair_is_that_of_the_inner_product_in_place_
 
 
 @pytest.mark.parametrize(("stiffness", "differs"), [("constant", False), ("affine", True), ("interpolated", True)])
-def test_errors_are_told_apart_where_the_stiffness_varies_alone(
+def test_errors_differ_where_the_stiffness_varies(
     stiffness: str, differs: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Elsewhere bounds are those of the sum of both, to the last bit."""
@@ -588,9 +582,7 @@ def test_what_is_stored_is_of_contact_and_reduced_size() -> None:
 
 
 @pytest.mark.parametrize("name", ["hertz", "moving"])
-def test_a_query_with_bounds_and_a_correction_evaluates_the_constraint_once(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bounds_and_a_correction_evaluate_the_constraint_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The assembly of "moving" projects it, that of Hertz takes less, and certificate and correction share one."""
     if name == "moving":
         problem, model, certificate = prepared("interpolated")

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from numerics import exact, spd
 from scipy.optimize import lsq_linear
 
-from vibench.interfaces.dual_sets import DualSet
-from vibench.interfaces.problem import Contact, VariationalInequality
+from vibench import Contact, DualSet, VariationalInequality
 from vibench.model.certificates import contact_correction
 from vibench.model.certificates.contact_correction import (
     ContactCompliance,

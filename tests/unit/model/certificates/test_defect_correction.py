@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import exact, spd
 
-from vibench.interfaces.problem import Contact, VariationalInequality
+from vibench import Contact, VariationalInequality
 from vibench.linalg import EPS
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.certificates.contact_correction import ContactCompliance
@@ -74,7 +74,7 @@ SIZES = st.sampled_from([0.0, 1e-3, 1.0])
 @pytest.mark.parametrize("soft", [False, True])
 @given(st.integers(0, 10_000), SIZES, SIZES, st.sampled_from([1.0, 1.5, 20.0]), st.sampled_from([N, 5, 0]))
 @settings(max_examples=15)
-def test_no_error_is_above_its_bound(
+def test_no_error_exceeds_its_bound(
     soft: bool, seed: int, size: float, pressure: float, spread: float, kept: int
 ) -> None:
     """Also where most of the residual is known by its norm alone, and where A is least of what X is."""
@@ -85,9 +85,7 @@ def test_no_error_is_above_its_bound(
 
 @given(st.integers(0, 10_000), SIZES, SIZES)
 @settings(max_examples=15)
-def test_bounds_are_the_errors_where_the_stiffness_is_the_inner_product(
-    seed: int, size: float, pressure: float
-) -> None:
+def test_bounds_are_errors_where_the_stiffness_is_the_inner_product(seed: int, size: float, pressure: float) -> None:
     pair = Pair(seed, size, pressure, 1.0)
     assert pair.bounds() == pytest.approx(pair.errors, rel=1e-5, abs=pair.round_off())
 

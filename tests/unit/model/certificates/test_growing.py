@@ -8,9 +8,8 @@ from buffered import buffered
 from cachetools import LRUCache
 from numerics import Tied, Varying
 
-from vibench import Array, create, project_on_cone
+from vibench import Array, Problem, VariationalInequality, create, project_on_cone
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
-from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import ReferenceAssembly
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.certificates.greedy import GreedyTrainer, IncrementalModel

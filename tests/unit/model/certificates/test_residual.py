@@ -23,7 +23,6 @@ SAMPLES = np.append(DECAY, [1.0, 0.0])[:, None] * rng.standard_normal((62, 30))
 
 
 def norm(basis: ResidualBasis, z: np.ndarray) -> float:
-    """Upper bound of the dual norm of a residual."""
     coordinates, beside, missing = basis.parts(z)
     return float(np.hypot(np.linalg.norm(coordinates), beside)) * (1.0 + basis.distortion) + missing
 
@@ -80,7 +79,6 @@ def test_few_directions_are_enough_for_many_terms() -> None:
 def test_a_random_range_leaves_what_it_says() -> None:
     S = np.linalg.qr(rng.standard_normal((50, 50)))[0] * 0.5 ** np.arange(50) @ rng.standard_normal((50, 80))
     found = residual._random_range(S, np.ones(S.shape[1]), 1e-3, limit=900, block=6)
-    assert found is not None
     Q, small, rest = found
     np.testing.assert_allclose(Q.T @ Q, np.eye(Q.shape[1]), atol=1e-12)
     assert np.linalg.norm(S - Q @ small) == pytest.approx(rest, rel=1e-6)

@@ -9,9 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import space, spd
 
-from vibench import InnerProduct
-from vibench.interfaces.parameters import ParameterBox
-from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench import InnerProduct, ParameterBox, Problem, VariationalInequality
 from vibench.model.certificates.spectral import AnchorGrid, TermRanges, leading_terms, rotated, spectral_bounds
 from vibench.stability.coercivity import operator_norm
 
@@ -122,7 +120,6 @@ def test_ranges_of_terms_bound_any_sum(seed: int, definite: int, others: int) ->
     reference[-1] = 1.0 + sum(abs(t) * np.linalg.norm(term, 2) for t, term in zip(reference, terms, strict=True))
     X = InnerProduct(sp.csc_array(sum(theta * term for theta, term in zip(reference, terms, strict=True))))
     ranges = TermRanges.of([sp.csr_array(term) for term in terms], reference, X, 0.0)
-    assert ranges is not None
     for _ in range(20):
         theta = reference * rng.uniform(-0.2, 3.0, len(terms))
         low, high = ranges.evaluate(theta)
@@ -136,7 +133,6 @@ def test_of_patches_alpha_is_the_smallest_quotient_of_coefficients() -> None:
     """The bound min θ_q(µ)/θ_q(µ̄) of semidefinite terms: it is attained where each acts alone."""
     patches = [sp.csr_array(np.diag([float(k == q) for k in range(9)])) for q in range(9)]
     ranges = TermRanges.of(patches, np.full(9, 0.5), InnerProduct(sp.csc_array(0.5 * np.eye(9))), 0.0)
-    assert ranges is not None
     theta = np.random.default_rng(0).uniform(0.1, 1.0, 9)
     low, high = ranges.evaluate(theta)
     assert theta.min() / 0.5 * (1.0 - 1e-6) <= low <= theta.min() / 0.5 <= theta.max() / 0.5 <= high
