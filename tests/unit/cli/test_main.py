@@ -11,6 +11,7 @@ import pytest
 from running import Main, Register, refused, succeeded
 from samples import STUDY, changed, write_study
 
+import vibench_problems
 from vibench import Status
 from vibench.cli.main import explained_words, renamed
 from vibench.plugins import kinds, registry
@@ -176,6 +177,8 @@ def test_dry_runs_list_the_matrix_and_lists_their_plugins(main: Main, tmp_path: 
         assert all(name in out for name in registered(kind))
         assert [title for title in lists if re.search(rf"^{title}(,|$)", out, re.MULTILINE)] == [what]
         if what == "studies":
+            shipped = (Path(vibench_problems.__path__[0]) / "studies").glob("*.toml")
+            assert {file.stem for file in shipped} <= set(registered(kind))
             assert f"{len(expand(read_study('quick')))} cells" in out
         if what == "solvers":
             shown = {line.split()[0]: line for line in out.splitlines() if line.split()}
