@@ -9,6 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from running import seal
 
 from vibench.results.break_even import HIGH_FIDELITY
@@ -22,8 +23,8 @@ KEYS = ("cell", "cell_a", "cell_b", "artefact", "model")
 SCALED = ("error_u", "error_lambda", "error_u_mean", "error_lambda_mean", "online_s", "solve_s", "offline_s")
 
 
-def write_many(run: Path, folder: Path, cells: int, queries: int = 16, solver: str = "piqp") -> Path:
-    """A results file with a number of cells, all of one solver, whose first `queries` queries are kept.
+def write_many(run: Path, folder: Path, cells: int) -> Path:
+    """A results file with a number of cells, all of one solver, whose first queries are kept.
 
     Clones differ as the cells of a large study do: in the label of the dual strategy, of which there are four times as
     many, in the pair of tolerances, of which there are two, then in the label of the primal strategy. Returns its path.
@@ -36,27 +37,27 @@ def write_many(run: Path, folder: Path, cells: int, queries: int = 16, solver: s
         known = {table: [dict(row) for row in db.execute(f"SELECT * FROM {table}")] for table in CLONED}
         for table in (*CLONED, "timings", "solutions", "disagreements"):
             db.execute(f"DELETE FROM {table}")
-        known["cells"] = [row for row in known["cells"] if row["solver"] == solver]
-        known["queries"] = [row for row in known["queries"] if row["solver"] == solver and row["query"] < queries]
-        known["thresholds"] = [row for row in known["thresholds"] if row["solver"] == solver]
+        for table, rows in known.items():
+            known[table] = [row for row in rows if row.get("solver", "piqp") == "piqp" and not row.get("query")]
         for clone in range(-(-cells // len(known["cells"]))):
             left = {row["cell"] for row in known["cells"][: cells - clone * len(known["cells"])]}
             for table, rows in known.items():
                 mine = [row for row in rows if {row.get("cell"), row.get("cell_b")} & left or table == "histories"]
-                _insert(db, table, [_cloned(row, clone, queries) for row in mine])
+                frame = pd.DataFrame([_cloned(row, clone) for row in mine], dtype=object)
+                frame.to_sql(table, db, if_exists="append", index=False)
         seal(db)
         db.commit()
     return path
 
 
-def _cloned(row: Mapping[str, Any], clone: int, queries: int) -> dict[str, Any]:
+def _cloned(row: Mapping[str, Any], clone: int) -> dict[str, Any]:
     """A row under other names: clone 0 is the row itself, but for the number of its queries."""
-    made = dict(row)
-    if "queries_ok" in made:
-        made |= {"queries": queries, "queries_ok": queries}
+    made = dict(row) | ({"queries": 1, "queries_ok": 1} if "queries_ok" in row else {})
     if not clone:
         return made
-    made |= {name: _key(made[name], clone) for name in KEYS if made.get(name)}
+    for name in KEYS:
+        if made.get(name):
+            made[name] = hashlib.sha256(f"{made[name]} {clone}".encode()).hexdigest()[: len(made[name])]
     if made.get("dual"):
         made["dual"] = f"{made['dual']} {clone % 4 + 1}"
     for name in ("pod_tol", "dual_tol"):
@@ -67,14 +68,3 @@ def _cloned(row: Mapping[str, Any], clone: int, queries: int) -> dict[str, Any]:
             made[name] = f"{made[name]} {clone // 8 + 1}"
     factor = random.Random(clone).uniform(0.5, 2.0)
     return made | {name: made[name] * factor for name in SCALED if made.get(name) is not None}
-
-
-def _key(key: str, clone: int) -> str:
-    return hashlib.sha256(f"{key} {clone}".encode()).hexdigest()[: len(key)]
-
-
-def _insert(db: sqlite3.Connection, table: str, rows: list[dict[str, Any]]) -> None:
-    if rows:
-        names = ", ".join(f'"{name}"' for name in rows[0])
-        marks = ", ".join("?" * len(rows[0]))
-        db.executemany(f"INSERT INTO {table} ({names}) VALUES ({marks})", [tuple(row.values()) for row in rows])

@@ -20,8 +20,7 @@ from distributed import LocalCluster
 from distributed.security import Security
 from distributed.utils import get_mp_context
 from fake_stages import KillsItsSupervisor, Whole
-from forking import forked
-from running import PATIENCE, Main, Vibench, assert_same_numbers, read_until, refused
+from running import PATIENCE, Main, Vibench, assert_same_numbers, refused
 from samples import wire_study, write_study
 from template import TEMPLATE, template
 
@@ -174,28 +173,6 @@ def test_other_code_or_store_is_refused(cluster: LocalCluster, tmp_path: Path, m
     monkeypatch.setattr(executors, "_describe", elsewhere)
     with pytest.raises(RequestError, match="does not see the artefacts"):
         Dask(cluster.scheduler_address, 1, tmp_path)
-
-
-@pytest.mark.long
-def test_a_run_goes_on_without_a_lost_cluster(plugins_folder: Path, vibench: Vibench, tmp_path: Path) -> None:
-    waits = {"name": "cone-waits", "options": {"file": str(tmp_path / "go on")}}
-    path = write_study(tmp_path, wire_study(dual=["cpg", waits]))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(plugins_folder)  # which processes that are spawned inherit
-        cluster = LocalCluster(n_workers=2, threads_per_worker=1, protocol="tcp", dashboard_address="127.0.0.1:0")
-    options = ["run", path, "--executor", "dask", "--scheduler", cluster.scheduler_address]
-    with forked(options, tmp_path, plugins_folder) as process:
-        read_until(process, "[1/2] ok")
-        cluster.close()
-        _, err = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 1
-    assert err.splitlines()[-1].startswith("vibench: the dask ")
-    assert err.splitlines()[-1].endswith("run the same command again to continue")
-    (tmp_path / "go on").touch()
-    done = vibench(tmp_path, "run", path, "--jobs", "1")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "2 cells, 1 to run" in done.stdout
-    assert "2 cells, all ok" in done.stdout
 
 
 def test_wrong_requests_for_dask_are_one_line(main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -306,7 +306,7 @@ def test_hover_tells_cells_legends_hide_them_a_box_zooms(browser: Chrome, made: 
 
 @pytest.mark.long
 def test_a_page_of_many_cells_shows_some_rows_at_a_time(browser: Chrome, quick_run: Path, tmp_path: Path) -> None:
-    path = write_many(quick_run, tmp_path / "many", 60, queries=1)
+    path = write_many(quick_run, tmp_path / "many", 60)
     page = html.write(path, tmp_path / "many.html", figures=False)
     look(browser, page)
     count = '[data-table="summary"] .count'
