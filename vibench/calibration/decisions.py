@@ -70,9 +70,9 @@ Predict = Callable[[Array], Prediction]
 
 
 def refuse_bounded(K: DualSet) -> None:
-    """Raise a `RequestError` where multipliers are bounded: the accuracy above is derived for λ ≥ 0 alone."""
+    """Raise a `RequestError` where multipliers are bounded: the δ above is derived for λ ≥ 0 alone."""
     if K.blocks:
-        raise RequestError(f"λ has no bound, which the accuracy of solutions needs: no beta_A, as K has {K.names()}")
+        raise RequestError(f"decisions are proved for λ ≥ 0 alone, and K has {K.names()}; take a problem of contact")
 
 
 @constructed

@@ -55,7 +55,7 @@ def calibrate(
     recorded = recorded_cell(problem, cell) if cell else None
     chosen = _trained_cell(problem, option) if recorded is None else recorded.cell
     target = build_problem(chosen.problem)
-    with placed(str(data)):
+    with placed(problem):
         refuse_bounded(target.K)
     if synthetic:
         _write_synthetic(target, synthetic, share(noise), data, seed)

@@ -128,7 +128,7 @@ def test_faults_of_a_data_file_are_named(sensors: dict[str, Any], rest: str, sai
             "contact half-width",
             "no linear output of the problem is called 'contact half-width' (known: contact force, ",
         ),
-        ("tresca", "tangential force", "data.toml: λ has no bound, which the accuracy of solutions needs: no beta_A"),
+        ("tresca", "tangential force", "tresca: decisions are proved for λ ≥ 0 alone, and K has intervals"),
     ],
 )
 def test_what_has_no_bound_is_refused_before_a_model_is_trained(
