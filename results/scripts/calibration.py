@@ -18,7 +18,7 @@ import pandas as pd
 from page import Page, made_by, start
 
 import vibench
-from vibench.calibration.data import Data, Prior, synthetic
+from vibench.calibration.data import Data, Prior, Sensors, synthetic
 from vibench.calibration.decisions import Decisions, Predict, quickest_sensors
 from vibench.calibration.metropolis import Metropolis
 from vibench.timing import Stopwatch
@@ -76,9 +76,9 @@ def compare(folder: Path) -> None:
     for name, truth in PROBLEMS.items():
         problem = vibench.create("problem", name, {"resolution": "paper"})
         predicts: list[Predict] = []
-        by, training = "", 0.0
+        by, training, exact = "", 0.0, Sensors(problem)(np.array(truth))
         for noise in NOISES:
-            data = synthetic(problem, np.array(truth), noise, SEED)
+            data = synthetic(problem, exact, noise, SEED)
             states, seconds, solutions = reference(folder / f"{name}-{100 * noise:g}.npz", problem, data)
             if (name, 100 * noise) in known(folder):
                 continue

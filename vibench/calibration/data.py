@@ -151,7 +151,7 @@ def outputs_of(problem: Problem, names: Sequence[str] | None = None) -> tuple[Ou
 
 
 class Sensors:
-    """Linear outputs of high-fidelity solutions, by their names.
+    """Linear outputs of high-fidelity solutions, all or by their names.
 
     Solutions are as accurate as bounds allow for: their natural residuals are at most `accuracy`.
     """
@@ -159,7 +159,7 @@ class Sensors:
     # A hundredth of what is verified elsewhere, and a hundred times what is usual: bounds grow by twice its root.
     accuracy = 1e-12
 
-    def __init__(self, problem: Problem, names: Sequence[str]) -> None:
+    def __init__(self, problem: Problem, names: Sequence[str] | None = None) -> None:
         self._outputs, self._solver = outputs_of(problem, names), HighFidelitySolver(problem)
 
     def __call__(self, mu: Array) -> Array:
@@ -213,10 +213,9 @@ def share(text: str) -> float:
     return float(found[1]) / 100.0
 
 
-def synthetic(problem: Problem, mu: Array, noise: float, seed: int) -> Data:
-    """All linear outputs at mu (d,) with random errors, whose deviations are a share of their values."""
+def synthetic(problem: Problem, exact: Array, noise: float, seed: int) -> Data:
+    """All linear outputs, exact values (k,) with random errors, whose deviations are a share of these values."""
     names = tuple(output.name for output in outputs_of(problem))
-    exact = Sensors(problem, names)(mu)
     deviations = noise * np.abs(exact)
     errors = np.random.default_rng(seed).standard_normal(len(exact))
     return Data.independent(names, exact + deviations * errors, deviations)

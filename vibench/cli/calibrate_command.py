@@ -90,12 +90,12 @@ def _trained_cell(problem: str, option: list[str] | None) -> Cell:
 
 def _write_synthetic(problem: Problem, mu: str, noise: float, file: Path, seed: int) -> None:
     """Write data of all linear outputs at a parameter, unless the file has the same ones."""
-    from vibench.calibration.data import as_toml, synthetic
+    from vibench.calibration.data import Sensors, as_toml, synthetic
     from vibench.files import write_atomically, writing
     from vibench.offline.models import parameter_in
 
     at = parameter_in(problem.parameters, components("--synthetic", mu))
-    text = as_toml(synthetic(problem, at, noise, seed), problem)
+    text = as_toml(synthetic(problem, Sensors(problem)(at), noise, seed), problem)
     if file.exists() and file.read_text(encoding="utf-8") != text:
         raise RequestError(f"'{file}' exists with other data; leave out --synthetic, or choose another name")
     with writing(file):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibench.calibration.data import Prior, outputs_of, synthetic
+from vibench.calibration.data import Prior, Sensors, outputs_of, synthetic
 from vibench.calibration.decisions import Decisions, Predict, Prediction, quickest_sensors
 from vibench.calibration.metropolis import Metropolis
 from vibench.offline.models import Model
@@ -44,8 +44,9 @@ class CalibrationStage(Stage):
         unbounded = model.certificate is None
         predict, by = (_unbounded(model, sensors), "model") if unbounded else quickest_sensors(model, sensors)
         rows: list[Row] = []
+        exact = Sensors(problem)(box.sample(1, seed)[0])
         for noise in (0.03, 0.01, 0.003):
-            data = synthetic(problem, box.sample(1, seed)[0], noise, seed)
+            data = synthetic(problem, exact, noise, seed)
             decisions = Decisions(problem, data, (predict,), 0.01, seed)
             # As many steps as show a decision in a hundred.
             chain = Metropolis(decisions, Prior.of(box), 100, seed)

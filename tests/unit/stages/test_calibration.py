@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vibench
-from vibench.calibration.data import Prior, synthetic
+from vibench.calibration.data import Prior, Sensors, synthetic
 from vibench.calibration.decisions import Decisions
 from vibench.calibration.metropolis import Metropolis
 from vibench.results.read import read_table
@@ -52,9 +52,9 @@ def test_a_model_without_bounds_walks_the_high_fidelity_chain_and_its_wrong_deci
     strategies = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
     model = vibench.Reduction(problem, *strategies, vibench.Stop(size=1), vibench.Stop(size=2), 0.5).model
     names = tuple(output.name for output in problem.outputs)
-    chains = []
+    chains, exact = [], Sensors(problem)(np.array([0.17, 0.1]))
     for models in ((_unbounded(model, names),), ()):
-        decisions = Decisions(problem, synthetic(problem, np.array([0.17, 0.1]), 0.01, 1), models, 0.01, 0)
+        decisions = Decisions(problem, synthetic(problem, exact, 0.01, 1), models, 0.01, 0)
         chain = Metropolis(decisions, Prior.of(problem.parameters), 10, 5)
         while chain.steps < 60:
             chain.step()
