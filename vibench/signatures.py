@@ -64,7 +64,7 @@ def bordered(
         for name, member in list(vars(called).items()):
             if isinstance(member, classmethod) and name[0] != "_":
                 setattr(called, name, classmethod(bordered(member.__func__)))
-        return cast(F, constructed(guarded(called)))
+        return cast(F, bordered_constructor(bordered_methods(called)))
     # Annotations may name what is defined below the function.
     signature = functools.cache(lambda: _Signature(called, owner, declared or called))
 
@@ -78,7 +78,7 @@ def bordered(
     return cast(F, call)
 
 
-def guarded(kind: type[T]) -> type[T]:
+def bordered_methods(kind: type[T]) -> type[T]:
     """Check the arguments of the public methods of a class, whose constructor is called too often."""
     for name, member in list(vars(kind).items()):
         if isinstance(member, types.FunctionType) and name[0] != "_":
@@ -86,13 +86,13 @@ def guarded(kind: type[T]) -> type[T]:
     return kind
 
 
-def constructed(kind: type[T]) -> type[T]:
+def bordered_constructor(kind: type[T]) -> type[T]:
     """Check the arguments of the constructor of a class, whose methods are called too often."""
     kind.__init__ = bordered(kind.__init__)  # type: ignore[method-assign]
     return kind
 
 
-def overridden(kind: type, module: str) -> None:
+def bordered_overrides(kind: type, module: str) -> None:
     """Check the arguments of methods of a class by the annotations of those in a module that they override."""
     bases = [base for base in kind.__mro__[1:] if base.__module__ == module]
     for name, member in list(vars(kind).items()) if kind.__module__ != module else ():

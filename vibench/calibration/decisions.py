@@ -40,7 +40,7 @@ from vibench.offline.compiled import loaded
 from vibench.offline.exported import exported
 from vibench.offline.models import Model
 from vibench.qp.verification import QPSolution, extended
-from vibench.signatures import Rule, Seed, bordered, constructed
+from vibench.signatures import Rule, Seed, bordered, bordered_constructor
 from vibench.stability.coercivity import share_of_diagonal
 from vibench.timing import timed
 
@@ -75,7 +75,7 @@ def refuse_bounded(K: DualSet) -> None:
         raise RequestError(f"decisions are proved for λ ≥ 0 alone, and K has {K.names()}; take a problem of contact")
 
 
-@constructed
+@bordered_constructor
 class BoundedSensors:
     """Outputs of a reduced model with proved or verified bounds.
 
@@ -168,7 +168,7 @@ def _correlation(X: InnerProduct, functionals: Array, norms: Array) -> Array | N
     return np.asarray(p.T @ product, float) / np.outer(norms, norms) if is_sharp else None
 
 
-@constructed
+@bordered_constructor
 class CompiledSensors:
     """The outputs of `BoundedSensors` by a C program, compiled and loaded into this process: a query is one call.
 

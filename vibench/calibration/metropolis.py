@@ -12,13 +12,13 @@ from vibench.arrays import Array, Mask
 from vibench.calibration.data import Prior
 from vibench.calibration.decisions import Decisions
 from vibench.errors import foreign
-from vibench.signatures import Count, Seed, constructed
+from vibench.signatures import Count, Seed, bordered_constructor
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-@constructed
+@bordered_constructor
 class Metropolis:
     """A chain of parameters whose distribution tends to the posterior (Metropolis et al. 1953).
 

@@ -21,7 +21,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, SparseMatrix, frozen, read_only, real_vector
 from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.interfaces.absent_rows import ABSENT, is_absent
-from vibench.signatures import bordered, constructed
+from vibench.signatures import bordered, bordered_constructor
 from vibench.text import normal_name
 
 CONSTANTS: Mapping[str, float] = {"pi": math.pi, "e": math.e}
@@ -206,7 +206,7 @@ class Thetas:
         return np.array([theta(mu) if callable(theta) else theta for theta in self.functions], float)
 
 
-@constructed
+@bordered_constructor
 @dataclass(frozen=True)
 class AffineSum:
     """A member Σ_q θ_q(mu) · terms_q of a variational inequality.

@@ -10,7 +10,7 @@ import numpy as np
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError, in_a_line
-from vibench.signatures import bordered, constructed
+from vibench.signatures import bordered, bordered_constructor
 
 OutputFunction = Callable[[Array, Array, Array], float]
 """From a parameter mu (d,) and a solution u (n,), λ (m,) to a number."""
@@ -76,7 +76,7 @@ class Output:
             raise NumericalError(f"the output '{self.name}' fails at mu = {mu.tolist()}: {in_a_line(error)}") from error
 
 
-@constructed
+@bordered_constructor
 @dataclass(frozen=True)
 class Picture:
     """A solution to be drawn.

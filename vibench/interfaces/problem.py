@@ -23,10 +23,10 @@ from vibench.interfaces.outputs import MeshFields, Output, Picture
 from vibench.interfaces.parameters import ParameterBox
 from vibench.linalg.factorisations import DEFAULT
 from vibench.linalg.inner_product import InnerProduct
-from vibench.signatures import Count, Rule, Seed, bordered, guarded, overridden
+from vibench.signatures import Count, Rule, Seed, bordered, bordered_methods, bordered_overrides
 
 
-@guarded
+@bordered_methods
 @dataclass(frozen=True)
 class VariationalInequality:
     """u = argmin ½ uᵀA u − fᵀu + σ_K(B u − g) at one parameter, B u ≤ g for rays (paper, equations (1), (2) and (7)).
@@ -134,7 +134,7 @@ Sampler = Callable[[Array], Mapping[str, Array]]
 """From a parameter mu (d,) to the values of chosen entries, by member."""
 
 
-@guarded
+@bordered_methods
 class Problem(ABC):
     """A parametrised variational inequality with its high-fidelity discretisation.
 
@@ -172,7 +172,7 @@ class Problem(ABC):
 
     def __init_subclass__(cls, **named: Any) -> None:
         super().__init_subclass__(**named)
-        overridden(cls, __name__)
+        bordered_overrides(cls, __name__)
 
     @classmethod
     def data_digest(cls, **options: Any) -> str:  # noqa: ARG003

@@ -20,10 +20,10 @@ from vibench.interfaces.dual_sets import BlockKind
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
-from vibench.signatures import Count, NotNegative, bordered, constructed, overridden
+from vibench.signatures import Count, NotNegative, bordered, bordered_constructor, bordered_overrides
 
 
-@constructed
+@bordered_constructor
 @dataclass(frozen=True)
 class Stop:
     """Stopping criterion of a nested construction: a tolerance or a prescribed size, exactly one of the two.
@@ -109,7 +109,7 @@ class Strategy:
 
     def __init_subclass__(cls, **named: Any) -> None:
         super().__init_subclass__(**named)
-        overridden(cls, __name__)
+        bordered_overrides(cls, __name__)
 
 
 class DualStrategy(Strategy, ABC):

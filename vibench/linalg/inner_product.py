@@ -18,7 +18,7 @@ from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky, have_one_pattern
 from vibench.linalg.definite import Factor
 from vibench.linalg.factorisations import DEFAULT, implementation
-from vibench.signatures import Judged, bordered, constructed
+from vibench.signatures import Judged, bordered, bordered_constructor
 from vibench.text import shown
 
 RANK_RTOL = 1e-12
@@ -43,7 +43,7 @@ def factorised_later() -> Iterator[None]:
         product._solver  # noqa: B018
 
 
-@constructed
+@bordered_constructor
 class InnerProduct:
     """The inner product ⟨u, v⟩ = uᵀ X v of a space, X sparse symmetric positive definite (n×n).
 

@@ -39,7 +39,7 @@ from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers, solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
-from vibench.signatures import Count, Judged, NotNegative, Positive, Share, bordered, constructed, rule_of
+from vibench.signatures import Count, Judged, NotNegative, Positive, Share, bordered, bordered_constructor, rule_of
 from vibench.text import normal_name, shown
 from vibench.timing import NO_TIME, Seconds, timed
 
@@ -522,7 +522,7 @@ def _taken(answer: object, model: FormulationModel) -> FormulationAnswer:
     return replace(answer, x=vectors["x"], alpha=vectors["alpha"])
 
 
-@constructed
+@bordered_constructor
 class ProgramModel(FormulationModel):
     """Assembles the program of a reduced model at a parameter, and leaves its solution to the QP solver of the cell."""
 

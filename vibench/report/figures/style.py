@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 
 from vibench.errors import RequestError
 from vibench.files import writing
-from vibench.signatures import AtLeastOne, Count, Positive, Rule, bordered, constructed, refuse_others, rule_of
+from vibench.signatures import AtLeastOne, Count, Positive, Rule, bordered, bordered_constructor, refuse_others, rule_of
 from vibench.text import printable
 
 # Equidistant in lightness (CIELAB, 22 to 78 in steps of 8), so that grey print keeps them apart, with the hues that are
@@ -80,7 +80,7 @@ class Look:
 HIGH_FIDELITY_LOOK = Look("#000000", "s", 0)
 
 
-@constructed
+@bordered_constructor
 @dataclass(frozen=True)
 class Series:
     """A series of a figure: name of its strategy or solver, variant such as a tolerance, and `way` of its queries."""
@@ -117,7 +117,7 @@ def _looks_of(names: Iterable[str]) -> dict[str, Look]:
     return looks
 
 
-@constructed
+@bordered_constructor
 class Looks:
     """The looks of the series of one figure, of which no two are the same.
 
@@ -152,7 +152,7 @@ def _dashes(way: str, ways: Sequence[str]) -> Any:
     return usual[way] if way in usual else more[others.index(way) % len(more)]
 
 
-@constructed
+@bordered_constructor
 @dataclass(frozen=True)
 class Layout:
     """Size of a panel in inches, and the panels that have room for a colour bar right of them."""
