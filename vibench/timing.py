@@ -24,9 +24,6 @@ SLOW = 1.0
 # Rounds of two blocks; fewer do not show the scatter between blocks, so that nothing is decided.
 FEWEST_ROUNDS = 6
 
-# Environment in which numerical libraries start with one thread.
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
-
 
 @dataclass(frozen=True)
 class Seconds:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 if __name__ == "__main__":  # before NumPy is imported
-    from vibench.timing import ONE_THREAD
+    from vibench.guardian import ONE_THREAD
 
     os.environ.update(ONE_THREAD)
 

@@ -191,9 +191,10 @@ def test_suspended_runs_are_not_late_limits_begin_with_work(monkeypatch: pytest.
 
 
 @pytest.mark.usefixtures("new_workers")
-def test_a_process_not_begun_is_given_up(watcher: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_not_begun_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisor._JobState, "start_seconds", 0.1)
-    found = watcher.run(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
+    with contextlib.closing(Supervisor(environment={"PYTHONHASHSEED": "7"})) as of_interpreters:
+        found = of_interpreters.run(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
     assert found == Failed(Status.CRASHED, "no worker process began within 0.1 s")
 
 

@@ -9,11 +9,12 @@ itself. Tests of how processes start and what belongs to them take new interpret
 import atexit
 import contextlib
 import gc
+import itertools
 import os
 import pickle
 import resource
 import runpy
-import select
+import selectors
 import shutil
 import signal
 import socket
@@ -32,7 +33,7 @@ from typing import Any
 
 from template import paths, template
 
-from vibench.execution import supervisor
+from vibench.execution import forking, supervisor
 
 LOADED = [
     "annotated_types", "cachetools", "jinja2", "lazy_loader", "multiprocessing.connection", "numpy", "osqp", "pandas",
@@ -52,36 +53,14 @@ SUPERVISOR = "VIBENCH_TESTS_SUPERVISOR"
 start_new_worker = supervisor.start_worker
 
 
-class Forked:
+class Forked(forking.Forked):
     """A process that the template has forked; what `subprocess.Popen` is to a supervisor."""
 
     def __init__(self, address: str, request: Mapping[str, Any], *files: int) -> None:
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._socket.connect(address)
-        content = pickle.dumps(request)
-        socket.send_fds(self._socket, [struct.pack("q", len(content))], files)
-        self._socket.sendall(content)
-        self.pid, self.returncode = self._number(), None
-
-    def _number(self) -> int:
-        """A number from the template: the process id, and the exit code once there is one."""
-        content = self._socket.recv(8, socket.MSG_WAITALL)
-        # At the end of the tests the template ends before the supervisors that are closed at exit.
-        return int(struct.unpack("q", content)[0]) if content else -signal.SIGKILL
-
-    def poll(self) -> int | None:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.wait(0.0)
-        return self.returncode
-
-    def wait(self, timeout: float | None = None) -> int:
-        """The exit code; a `TimeoutExpired` if the process does not end within so many seconds."""
-        if self.returncode is None:
-            if not select.select([self._socket], [], [], timeout)[0]:
-                raise subprocess.TimeoutExpired("a forked process", timeout or 0.0)
-            self.returncode = self._number()
-            self._socket.close()
-        return self.returncode
+        status = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        status.connect(address)
+        socket.send_fds(status, [pickle.dumps(request)], files)
+        super().__init__(status)
 
 
 class ForkedCommand(Forked):
@@ -160,10 +139,10 @@ def run_pytest(folder: Path, site: Path, *arguments: str) -> subprocess.Complete
 def fork_workers(address: Callable[[], str] = template) -> Iterator[None]:
     """Block in which the worker processes that this process starts are forked, by the template at an address."""
 
-    def start(descriptor: int, log: str, environment: Mapping[str, str]) -> Any:
+    def start(descriptor: int, log: str, environment: Mapping[str, str], *, forks: bool) -> Any:
         # Only a new interpreter has another seed than this process was given; dask leaves one in the environment.
         if environment.get("PYTHONHASHSEED") != os.environ.get("PYTHONHASHSEED"):
-            return start_new_worker(descriptor, log, environment)
+            return start_new_worker(descriptor, log, environment, forks=forks)
         request = {
             "main": "worker", "arguments": ["worker", str(descriptor), log], "folder": str(Path.cwd()),
             "environment": {**environment, SUPERVISOR: str(os.getpid())},
@@ -181,27 +160,29 @@ def fork_workers(address: Callable[[], str] = template) -> Iterator[None]:
 def main() -> None:
     """Serve requests at an address until the other end of a socket is closed."""
     alive, address = socket.socket(fileno=int(sys.argv[1])), sys.argv[2]
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listener.bind(address)
     listener.listen(64)
     alive.sendall(b"+")  # who asks now waits until all is loaded
     _load()
-    wake, waking = socket.socketpair()
-    for end in (wake, waking):
-        end.setblocking(False)
-    signal.signal(signal.SIGCHLD, lambda *_: None)
-    signal.set_wakeup_fd(waking.fileno(), warn_on_full_buffer=False)
-    children: dict[int, socket.socket] = {}
-    while alive not in (ready := select.select([alive, listener, wake], [], [])[0]):
-        if wake in ready:
-            wake.recv(1024)
-            _tell(children)
-        if listener in ready:
-            client = listener.accept()[0]
-            pid = _forked(client, (alive, listener, wake, waking, client, *children.values()))
-            children[pid] = client
+    ready = selectors.DefaultSelector()
+    for end in (alive, listener):
+        ready.register(end, selectors.EVENT_READ)
+    while alive not in (keys := {key.fileobj: key for key, _ in ready.select()}):
+        for number, key in keys.items():
+            if number is listener:
+                client = listener.accept()[0]
+                told = _forked(client)
+                ready.register(os.pidfd_open(told), selectors.EVENT_READ, (told, client))
+            else:
+                ready.unregister(number)
+                os.close(key.fd)
+                pid, client = key.data
+                told = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
             with contextlib.suppress(BrokenPipeError):
-                client.sendall(struct.pack("q", pid))
+                client.sendall(struct.pack("q", told))
+            if number is not listener:
+                client.close()
     shutil.rmtree(Path(address).parent)
 
 
@@ -227,16 +208,13 @@ def _hash_stages(kind: Any) -> None:
         _hash_stages(stage)
 
 
-def _forked(client: socket.socket, own: Sequence[socket.socket]) -> int:
-    """Fork the process that a client asks for; gives its number. It closes what is the template's own."""
-    length, files, _, _ = socket.recv_fds(client, 8, 2)
-    content, missing = b"", struct.unpack("q", length)[0]
-    while len(content) < missing:
-        content += client.recv(missing - len(content))
+def _forked(client: socket.socket) -> int:
+    """Fork the process that a client asks for, with its files alone; gives its number."""
+    content, files, *_ = socket.recv_fds(client, 2**20, 2)
     pid = os.fork()
     if not pid:
-        for end in own:
-            end.close()
+        for first, last in itertools.pairwise([2, *sorted(files), os.sysconf("SC_OPEN_MAX")]):
+            os.closerange(first + 1, last)
         _be(pickle.loads(content), files)
     with contextlib.suppress(PermissionError, ProcessLookupError):
         os.setpgid(pid, pid)  # it leads a group of its own, whoever is first to say so
@@ -245,22 +223,11 @@ def _forked(client: socket.socket, own: Sequence[socket.socket]) -> int:
     return pid
 
 
-def _tell(children: dict[int, socket.socket]) -> None:
-    for pid, client in list(children.items()):
-        ended, status = os.waitpid(pid, os.WNOHANG)
-        if ended:
-            with contextlib.suppress(BrokenPipeError):
-                client.sendall(struct.pack("q", os.waitstatus_to_exitcode(status)))
-            children.pop(pid).close()
-
-
 def _be(request: Mapping[str, Any], files: Sequence[int]) -> None:
     """Be the process that was asked for, and exit as an interpreter does."""
     code = 1
     try:
         os.setpgid(0, 0)
-        signal.set_wakeup_fd(-1)
-        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         os.chdir(request["folder"])
         os.environ.clear()

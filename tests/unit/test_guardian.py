@@ -9,6 +9,8 @@ from pathlib import Path
 
 import fake_stages
 
+from vibench.guardian import new_environment
+
 ORPHANS = """
 import os, resource, signal, subprocess, sys, time
 from pathlib import Path
@@ -84,3 +86,9 @@ def orphans(entry: bytes) -> Iterator[str]:
         with contextlib.suppress(OSError):
             if entry in (folder / "environ").read_bytes().split(b"\0"):
                 yield (folder / "cmdline").read_text().replace("\0", " ")
+
+
+def test_new_processes_have_one_thread() -> None:
+    code = "import numpy, threadpoolctl; print({x['num_threads'] for x in threadpoolctl.threadpool_info()})"
+    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, check=True, env=new_environment())
+    assert done.stdout.strip() == b"{1}"

@@ -1,5 +1,4 @@
 import itertools
-import os
 import subprocess
 import sys
 import threading
@@ -10,7 +9,7 @@ import pytest
 from scipy.special import bdtr
 
 from vibench import timing
-from vibench.timing import NO_TIME, ONE_THREAD, Calibration, Seconds, median_interval, median_seconds, timed
+from vibench.timing import NO_TIME, Calibration, Seconds, median_interval, median_seconds, timed
 
 
 @pytest.fixture
@@ -106,13 +105,6 @@ def in_a_child() -> None:
 @pytest.mark.parametrize("work", [in_a_thread, in_a_child])
 def test_work_in_a_thread_or_in_a_child_process_is_counted(work: Callable[[], None]) -> None:
     assert timed(work)[1].cpu >= 0.05
-
-
-def test_processes_started_with_it_have_one_thread() -> None:
-    code = "import numpy, threadpoolctl; print({x['num_threads'] for x in threadpoolctl.threadpool_info()})"
-    environment = os.environ | ONE_THREAD
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
-    assert done.stdout.strip() == "{1}"
 
 
 def test_the_calibration_tells_how_much_slower_and_is_not_marked_by_a_quick_run(clocks: Callable[..., None]) -> None:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 import subprocess
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.resources import files
 from itertools import product
@@ -13,13 +10,12 @@ from typing import Any, NamedTuple
 
 from vibench.errors import RequestError, VibenchError
 from vibench.execution.supervisor import manner_of_death
-from vibench.guardian import MARK, guarded
+from vibench.guardian import guarded, new_environment
 from vibench.interfaces.strategies import Stop
 from vibench.plugins.kinds import CHECKED, PluginKind
 from vibench.plugins.registry import find, find_named, registered
 from vibench.qp.solve import installed_solvers
 from vibench.study.matrix import read_study
-from vibench.timing import ONE_THREAD
 
 Resolution = str | int  # a name that a problem knows, or a number of nodes
 Timing = Callable[..., None]  # the fixture `timing`: see `vibench.benchmarks.plugin`
@@ -136,9 +132,8 @@ def run_pytest(options: Sequence[str]) -> None:
     arguments = ["-c", f"{folder}/pytest.ini", "--rootdir", folder, "-p", "pytest_benchmark.plugin"]
     arguments += ["-p", "no:terminal", "--benchmark-quiet", "--progress", *options, f"{folder}/stages.py"]
     # Nothing but these options counts: neither those nor the plugins that somebody else's tests have.
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")} | ONE_THREAD
-    path = os.pathsep.join(folder for folder in sys.path if folder)
-    environment |= {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": path, MARK: secrets.token_hex(8)}
+    environment = {name: value for name, value in new_environment().items() if not name.startswith("PYTEST_")}
+    environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
     process = guarded("pytest", *arguments, environment=environment)
     done = subprocess.run(**process, stdout=subprocess.DEVNULL, check=False)
     if done.returncode not in (0, 1, 5):  # passed, some failed, there are none

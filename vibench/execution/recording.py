@@ -14,6 +14,7 @@ from vibench import provenance
 from vibench.errors import RequestError
 from vibench.execution.supervisor import OUT_OF_MEMORY
 from vibench.files import locked
+from vibench.guardian import ONE_THREAD
 from vibench.model.certificates.base import Guarantee
 from vibench.plugins.plugin import Plugin
 from vibench.qp.status import Status
@@ -31,7 +32,6 @@ from vibench.stages.timing_rounds import TimedRound, seconds_of_cell, seconds_of
 from vibench.study.cells import NO_SUCH_AXIS, Axes, Cell, digest
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.spec import Limits, Study
-from vibench.timing import ONE_THREAD
 
 # Files of a run folder: the output of plugins and solvers, and the report of `vibench report`.
 LOG, REPORT = "workers.log", "report.html"

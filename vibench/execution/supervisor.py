@@ -9,11 +9,9 @@ from __future__ import annotations
 import contextlib
 import mmap
 import os
-import secrets
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -25,11 +23,11 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from vibench.guardian import MARK, guarded, kill_marked
+from vibench.execution.forking import Forked, fork_worker
+from vibench.guardian import MARK, guarded, kill_marked, new_environment
 from vibench.provenance import libraries, numerical_code
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, ItemwiseStage, Stage, Unstored
-from vibench.timing import ONE_THREAD
 
 # Prefix of the reason of a job that exceeds the memory limit; the limit follows.
 OUT_OF_MEMORY = "out of memory: the limit is memory_gib"
@@ -220,8 +218,9 @@ class _JobState:
         return None
 
 
+Process = subprocess.Popen[bytes] | Forked
 # The connection to a worker process, the process, the mark of its descendants, and its current item.
-_Worker = tuple[Connection, "subprocess.Popen[bytes]", str, CurrentItem]
+_Worker = tuple[Connection, Process, str, CurrentItem]
 
 
 class Supervisor:
@@ -326,18 +325,15 @@ class Supervisor:
     def _worker(self, packages: frozenset[str]) -> _Worker:
         """The worker process of some packages, started if there is none."""
         if packages not in self._workers:
-            (ours, theirs), mark = socket.socketpair(), secrets.token_hex(8)
-            # With these (bytes) glibc keeps up to 1 GiB of freed memory: large arrays are not mapped anew page by page.
-            memory = {"MMAP_THRESHOLD": "33554432", "TRIM_THRESHOLD": "1073741824", "TOP_PAD": "67108864"}
-            environment = {**os.environ, **self._environment, **ONE_THREAD, MARK: mark}
-            environment |= {f"MALLOC_{name}_": size for name, size in memory.items()}
-            environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+            (ours, theirs), environment = socket.socketpair(), {**new_environment(), **self._environment}
+            # Two interpreters have two orders of sets, which shows whether results of a package depend on it.
+            forks = not packages and not self._environment
             with theirs, tempfile.TemporaryFile() as shared:
                 shared.truncate(8)
                 socket.send_fds(ours, [b"+"], [shared.fileno()])
                 current = CurrentItem(shared.fileno())
-                process = start_worker(theirs.fileno(), str(self._log or os.devnull), environment)
-            self._workers[packages] = Connection(ours.detach()), process, mark, current
+                process = start_worker(theirs.fileno(), str(self._log or os.devnull), environment, forks=forks)
+            self._workers[packages] = Connection(ours.detach()), process, environment[MARK], current
         self._workers.move_to_end(packages)
         return self._workers[packages]
 
@@ -353,8 +349,14 @@ class Supervisor:
             connection.close()
 
 
-def start_worker(descriptor: int, log: str, environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
-    """A worker process that serves the other end of a socket; the output of plugins goes to `log`."""
+def start_worker(descriptor: int, log: str, environment: Mapping[str, str], *, forks: bool) -> Process:
+    """A worker process that serves the other end of a socket; the output of plugins goes to `log`.
+
+    It is a new interpreter unless it is forked, where there is a server.
+    """
+    if forks:
+        with contextlib.suppress(OSError):
+            return fork_worker(descriptor, log, environment)
     # It leads its own process group: Ctrl-C on the terminal does not reach it, and children of plugins die with it, as
     # do those in other groups, by their mark.
     options = guarded("vibench.execution.worker", str(descriptor), log, environment=environment)
@@ -365,7 +367,7 @@ def _beyond(name: str, limit: float) -> Failed:
     return Failed(Status.TIMEOUT, f"stopped after {name} = {limit:g} s")
 
 
-def _cause_of_death(process: subprocess.Popen[bytes]) -> str:
+def _cause_of_death(process: Process) -> str:
     try:
         return f"the worker process died with {manner_of_death(process.wait(timeout=5.0))}"
     except subprocess.TimeoutExpired:

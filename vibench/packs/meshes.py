@@ -10,7 +10,6 @@ import importlib.util
 import io
 import os
 import resource
-import secrets
 import signal
 import subprocess
 import sys
@@ -21,9 +20,8 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, message_of
-from vibench.guardian import MARK, guarded
+from vibench.guardian import guarded, new_environment
 from vibench.text import one_line
-from vibench.timing import ONE_THREAD
 
 
 def format_of(path: Path) -> str:
@@ -45,8 +43,7 @@ def read_mesh(path: Path, limit: int, seconds: int) -> tuple[Array, Array]:
     form = format_of(path)
     if importlib.util.find_spec("meshio") is None:
         raise RequestError("it needs meshio: pip install 'vibench[mesh]'")
-    environment = {**os.environ, **ONE_THREAD, MARK: secrets.token_hex(8)}
-    process = guarded(__name__, form, str(path.absolute()), str(limit), str(seconds), environment=environment)
+    process = guarded(__name__, form, str(path.absolute()), str(limit), str(seconds), environment=new_environment())
     try:
         # A busy machine takes longer than the seconds of the processor; a process that sleeps ends, too.
         done = subprocess.run(**process, capture_output=True, check=False, timeout=600)
