@@ -13,7 +13,7 @@ from vibench.interfaces.strategies import Kind
 from vibench.plugins.registry import default_formulation
 from vibench.results import formats
 from vibench.results.break_even import Meaning
-from vibench.results.ranking import eligible, errors_of_solution, excluded
+from vibench.results.ranking import contenders, errors_of_solution
 from vibench.results.schema import Row
 from vibench.study.cells import NO_SUCH_AXIS
 
@@ -95,13 +95,11 @@ def verdicts(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[Verdict]
     # A per cent of u and of λ is what a designer calls accurate.
     error = 0.01
     against_full = thresholds[thresholds["cell_a"].isna()].set_index("cell_b")
-    timed, errors = cells["online_s"].notna(), errors_of_solution(cells)
-    taking_part, inexact = eligible(cells) & timed, excluded(cells)["inexact"] & errors.notna() & timed
+    errors = errors_of_solution(cells)
     for (problem, _), mine in cells.groupby(["problem", "problem_options"], dropna=False, sort=False):
         if (full := mine["hf_s"].astype(float)).isna().all():
             continue
-        # Those with large errors alone, which no comparison ranks, still tell how far from the error they are.
-        rivals = mine[(taking_part if taking_part[mine.index].any() else inexact)[mine.index]]
+        rivals = contenders(mine)
         fine = rivals[errors[rivals.index] <= error]
         # Seconds of a query and of a full solution are timed in the same rounds, when the machine has one speed.
         ranked = fine["online_s"].astype(float) / fine["hf_s"].astype(float) if len(fine) else errors[rivals.index]
