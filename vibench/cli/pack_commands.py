@@ -137,8 +137,12 @@ def _uses(pack: ModelPack, folder: Path) -> Iterator[str]:
     from vibench.model.affine import INTERPOLATION_RTOL, is_missed
 
     if pack.members:
-        most = "" if pack.validation is None else f", with validation = {len(pack.validation)} at most"
-        yield f"it can be run as a problem of a study{most}:"
+        most, asked = "", ""
+        if pack.validation is not None:
+            count = len(pack.validation)
+            most, asked = f", with validation = {count} at most", f" --validation {count}"
+        yield f"it can be run: vibench run --problem {folder}{asked}"
+        yield f"or as a problem of a study{most}:"
         yield "  [[problem]]"
         yield '  name = "pack"'
         # JSON quotes a path as TOML does.

@@ -100,7 +100,8 @@ class PackReader:
         if not all(member.everywhere for member in members.values()):
             if validation is None:
                 why = "since arrays or tables are given at listed parameters only"
-                raise RequestError(f"parameters.validation: required, {why}")
+                remedy = "move some of these from the training set; their arrays come last"
+                raise RequestError(f"parameters.validation: required, {why}: {remedy}")
             _refuse_repeated(self._listing, "parameters.training and parameters.validation together")
             box = replace(box, listed=self._listed)
         outputs = self._manifest.outputs

@@ -146,6 +146,14 @@ def eligible(cells: pd.DataFrame) -> pd.Series:
     return ~excluded(cells).any(axis=1)
 
 
+def contenders(cells: pd.DataFrame) -> pd.DataFrame:
+    """The cells of one problem of which a verdict names the best: eligible ones, else those whose errors are large."""
+    timed, errors = cells["online_s"].notna(), errors_of_solution(cells)
+    # Errors too large for a ranking still tell how far away an answer is.
+    taking_part, inexact = eligible(cells) & timed, excluded(cells)["inexact"] & errors.notna() & timed
+    return cells[taking_part if taking_part.any() else inexact]
+
+
 def too_loose(cells: pd.DataFrame, source: Literal["solver", "assembly"]) -> pd.Series:
     """Mask of the cells to which the source contributes too large a fraction of an error to compare strategies."""
     # At a tenth of an error the solver or the assembly, not the strategies, would decide who is more accurate.

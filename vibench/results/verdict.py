@@ -13,7 +13,7 @@ from vibench.interfaces.strategies import Kind
 from vibench.plugins.registry import default_formulation
 from vibench.results import formats
 from vibench.results.break_even import Meaning
-from vibench.results.ranking import eligible, errors_of_solution
+from vibench.results.ranking import contenders, errors_of_solution
 from vibench.results.schema import Row
 from vibench.study.cells import NO_SUCH_AXIS
 
@@ -23,8 +23,8 @@ class Verdict:
     """The answer for one problem; its text is two sentences.
 
     `best` is the row of the cells table with the fastest query within the error; where none is, of the smallest error.
-    It is `None` where no cell takes part in a comparison. `enriching` is the factor by which the best fixed enrichment
-    divides the mean error of λ at its POD and cone; `None` where the run lacks a model with enrichment or without.
+    It is `None` where no cell would be compared, whatever its error. `enriching` is the factor by which the best fixed
+    enrichment divides the mean error of λ at its POD and cone; `None` where a run has no model with it or without.
     """
 
     problem: str
@@ -95,11 +95,11 @@ def verdicts(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[Verdict]
     # A per cent of u and of λ is what a designer calls accurate.
     error = 0.01
     against_full = thresholds[thresholds["cell_a"].isna()].set_index("cell_b")
-    taking_part, errors = eligible(cells) & cells["online_s"].notna(), errors_of_solution(cells)
+    errors = errors_of_solution(cells)
     for (problem, _), mine in cells.groupby(["problem", "problem_options"], dropna=False, sort=False):
         if (full := mine["hf_s"].astype(float)).isna().all():
             continue
-        rivals = mine[taking_part[mine.index]]
+        rivals = contenders(mine)
         fine = rivals[errors[rivals.index] <= error]
         # Seconds of a query and of a full solution are timed in the same rounds, when the machine has one speed.
         ranked = fine["online_s"].astype(float) / fine["hf_s"].astype(float) if len(fine) else errors[rivals.index]

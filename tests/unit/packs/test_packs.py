@@ -232,7 +232,7 @@ def test_import_says_what_a_pack_can_do(tmp_path: Path, main: Main) -> None:
     assert code == 0
     for words in (
         "12 unknowns", "affine, 1 term", "KKT residuals up to", "anywhere in the box", "validation = 2 at most",
-        "; reduced assembly sums the terms of f, g\n",
+        "; reduced assembly sums the terms of f, g\n", "/pack --validation 2\n",
     ):  # fmt: skip
         assert words in out
     assert "interpolates" not in out
@@ -315,11 +315,10 @@ def test_constants_and_declared_sums_are_assembled_once(tmp_path: Path, monkeypa
 def test_the_python_example_of_the_page_exports_a_pack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = (Path(__file__).parents[3] / "docs" / "model-packs.md").read_text(encoding="utf-8")
     code = page.partition('```python title="export.py"\n')[2].partition("```")[0]
-    cable, listed = Cable(), np.array([[4.0, 0.2], [8.0, 0.3], [5.0, 0.2]])
+    cable, mu = Cable(), np.array([[4.0, 0.2], [5.0, 0.2], [8.0, 0.3]])
     monkeypatch.chdir(tmp_path)
-    given = {"training": listed[:2], "validation": listed[2:], "f": -cable.mass}
-    given |= {"g": np.outer(cable.mass, listed[:, 1])}
-    exec(code, {"A": cable.A, "B": cable.B, "X_V": cable.X_V, "X_W": cable.X_W, **given})
+    f, g = np.outer(-mu[:, 0], cable.mass), np.outer(mu[:, 1], cable.mass)
+    exec(code, {"A": 3 * [cable.A], "B": 3 * [cable.B], "f": list(f), "g": list(g), "mu": mu})
     assert_cable(read_model_pack("my-model"))
 
 

@@ -277,7 +277,7 @@ def test_any_label_makes_a_file_in_the_folder(change: Change, draw: Draw) -> Non
 
 @pytest.mark.parametrize("count", [7, 12])
 def test_a_panel_has_four_series_and_a_sentence_counts_the_others(count: int, tables: Tables) -> None:
-    data = tables["obstacle"]
+    data = replace(tables["obstacle"], cells=tables["obstacle"].cells.assign(error_lambda_mean=0.5))
 
     def many(frame: pd.DataFrame, column: str, original: str) -> pd.DataFrame:
         one = frame[frame[column] == original]

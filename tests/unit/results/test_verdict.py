@@ -46,9 +46,10 @@ def test_the_fastest_query_within_the_error_is_the_best_and_says_when_it_pays() 
 
 
 def test_what_is_missing_is_said_and_enrichment_is_judged_at_the_best_tolerances() -> None:
-    (far,) = judged(PLAIN, PLAIN | {"error_lambda_mean": 0.05})
+    (far,), (wild,) = judged(PLAIN, PLAIN | {"error_lambda_mean": 0.05}), judged(PLAIN | {"error_lambda_mean": 0.5})
     assert "No model is within 1 % for both u and λ; the closest is decorrelated on" in str(far)
     assert "0.1 % for u and 5 % for λ. It pays from 25 queries on" in str(far)
+    assert str(wild) == str(far).replace("and 5 %", "and 50 %")
     (nobody,) = judged(ENRICHED | {"status": "inaccurate"}, ENRICHED | {"solver_share_mean": 0.2})
     assert "No model of this run takes part in a comparison" in str(nobody)
     assert judged(ENRICHED | {"hf_s": None}) == []

@@ -13,7 +13,7 @@ from vibench.report.figures.solutions import draw_alone
 from vibench.report.figures.spaces import draw_stability
 from vibench.report.figures.style import CaptionedFigure, Layout, Looks, Series, Sheet, plot, scatter
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
-from vibench.results.ranking import eligible, errors_of_solution
+from vibench.results.ranking import contenders, errors_of_solution
 from vibench.results.schema import Row
 from vibench.results.verdict import Verdict, verdicts
 from vibench.study.cells import NO_SUCH_AXIS
@@ -74,7 +74,7 @@ def _empty(panel: Axes, text: str) -> str:
 
 def _rivals(data: ProblemTables, best: Row) -> pd.DataFrame:
     """The cells that are compared with the best one, itself included: those of its solver, and those without one."""
-    cells = data.cells[eligible(data.cells) & data.cells["online_s"].notna()]
+    cells = contenders(data.cells)
     alike = (cells["solver"] == best["solver"]) & (cells["accuracy"] == best["accuracy"])
     compared = cells[alike | (cells["solver"] == NO_SUCH_AXIS)]
     # Each gain is measured in the rounds of its cell, when the machine had one speed.
