@@ -137,14 +137,9 @@ def _uses(pack: ModelPack, folder: Path) -> Iterator[str]:
     from vibench.model.affine import INTERPOLATION_RTOL, is_missed
 
     if pack.members:
-        most, asked = "", ""
-        if pack.validation is not None:
-            count = len(pack.validation)
-            most, asked = f", with validation = {count} at most", f" --validation {count}"
-        yield f"it can be run: vibench run --problem {folder}{asked}"
-        yield f"or as a problem of a study{most}:"
-        yield "  [[problem]]"
-        yield '  name = "pack"'
+        count = "" if pack.validation is None else f" --validation {len(pack.validation)}"
+        yield f"it can be run: vibench run --problem {folder}{count}"
+        yield from ("or as a problem of a study:", "  [[problem]]", '  name = "pack"')
         # JSON quotes a path as TOML does.
         yield f"  options = {{ path = {json.dumps(str(folder), ensure_ascii=False)} }}"
         summed, interpolated = sorted(pack.affine), sorted(pack.entrywise - set(pack.affine))

@@ -232,8 +232,7 @@ def _check_parameters(given: Parameters) -> None:
         if low > high:
             raise RequestError(f"parameters: the lower bound {low:g} of '{name}' is above its upper bound {high:g}")
     # Neither has points from which a box could be taken.
-    if given.lower is None and given.training.grid is not None:
-        raise RequestError("parameters: a grid needs the box: give 'lower' and 'upper'")
-    if given.lower is None and given.validation is None:
-        remedy = "give 'validation', which arrays at listed parameters need anyway, or 'lower' and 'upper' to draw it"
-        raise RequestError(f"parameters: no validation set, and no box to draw it in: {remedy}")
+    if given.lower is None and (given.training.grid is not None or given.validation is None):
+        remedy = "'validation', which arrays at listed parameters need, or " * (given.training.grid is None)
+        needs = "parameters: a grid, or a random validation set, needs the box"
+        raise RequestError(f"{needs}: give {remedy}'lower' and 'upper'")

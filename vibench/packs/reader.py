@@ -99,9 +99,8 @@ class PackReader:
             K = DualSet(blocks)
         if not all(member.everywhere for member in members.values()):
             if validation is None:
-                why = "since arrays or tables are given at listed parameters only"
-                remedy = "move some of these from the training set; their arrays come last"
-                raise RequestError(f"parameters.validation: required, {why}: {remedy}")
+                why = "since arrays or tables are given at listed parameters only: list the last of these there"
+                raise RequestError(f"parameters.validation: required, {why}")
             _refuse_repeated(self._listing, "parameters.training and parameters.validation together")
             box = replace(box, listed=self._listed)
         outputs = self._manifest.outputs
