@@ -18,7 +18,7 @@ from vibench.interfaces.problem import NestedStart, OfBox, Problem, VariationalI
 from vibench.interfaces.validation import checked_assembly, in_float64, settled
 from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.linalg.inner_product import InnerProduct, check_positive_definite, check_symmetric
+from vibench.linalg.inner_product import InnerProduct, check_positive_definite, check_symmetric, factorised_later
 from vibench.linalg.schur_complement import FEW_PER_UNKNOWN, EliminationPattern
 from vibench.qp import verification
 from vibench.qp.exact import Directions, least_distance_solution, rows_that_matter
@@ -139,7 +139,10 @@ class HighFidelitySolver:
         if self._active:
             distances = np.linalg.norm((np.array(self._solved) - mu) / self._width, axis=1)
             nearest = self._active[int(np.argmin(distances))]
-        start, m = self._problem.start(mu.copy(), nearest), self._W.dim
+        with factorised_later():
+            start, m = self._problem.start(mu.copy(), nearest), self._W.dim
+            if isinstance(start, NestedStart):
+                start.coarse.factorised_by(self._problem.factorisation)
         if isinstance(start, NestedStart):
             if self._coarse is None or self._coarse._problem is not start.coarse:
                 self._coarse = HighFidelitySolver(start.coarse)
@@ -233,7 +236,7 @@ def solve_unverified(
         (u, forces, iterations), fallback = _without_cycling(program, reading.equal, system)
     lam = reading.multipliers(forces, len(vi.g))
     # A large rigid displacement amplifies round-off in the eliminated unknowns; a stiff problem does so everywhere.
-    if _is_inaccurate(vi, u, lam):
+    if system.iterating is None and _is_inaccurate(vi, u, lam):
         u = u + system.correct_eliminated(vi.f - vi.A @ u - vi.B.T @ lam)
         if _is_inaccurate(vi, u, lam):
             u, lam = _refined(vi, stiffness, u, lam)
@@ -373,7 +376,7 @@ def active_set_iterations(
         except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
             return None
         forces, excess = weights * lam, B @ u - g
-        off = unit * (sizes @ np.abs(u) + np.abs(g))
+        off = unit * (sizes @ np.abs(u) + np.abs(g)) + (system.iterating.noise if system.iterating else 0.0)
         violated = ~active & (excess > off)
         if system.beyond is not None:
             violated &= system.beyond.watched
@@ -389,11 +392,12 @@ def active_set_iterations(
             key = following.tobytes() + held.tobytes()
         else:
             held, changed, key = None, np.flatnonzero(following != active), following.tobytes()
-        if not len(changed):
-            return u, lam, iteration
-        if key in seen:
-            return None
-        seen.add(key)
+        if system.iterating is None or system.iterating.is_exact:
+            if not len(changed):
+                return u, lam, iteration
+            if key in seen:
+                return None
+            seen.add(key)
         active, fixed = following, held
     return None
 
