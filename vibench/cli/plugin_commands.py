@@ -229,10 +229,12 @@ def _find_object(module: str, name: str) -> RegisteredPlugin:
 
     from vibench.plugins.registry import RegisteredPlugin
 
+    # A file of the current folder is a module, too.
+    module = module.removesuffix(".py")
     where = f"{module}:{name}"
     title = f"'{where}'"
     if not module or not all(part.isidentifier() for part in [*module.split("."), name]):
-        raise RequestError(f"{title} is neither KIND:NAME ({', '.join(CHECKED)}) nor MODULE:NAME")
+        raise RequestError(f"{title} is neither KIND:NAME ({', '.join(CHECKED)}) nor MODULE:NAME nor FILE.py:NAME here")
     # Modules of the current folder count, as with `python -m`.
     if str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))

@@ -219,6 +219,8 @@ def print_summary(path: Path, rows: Rows) -> None:
     differ = bool(disagreements["flagged"].sum())
     if differ:
         echo(consistency.agreement_sentence(disagreements, cells["solver"].nunique()))
+    if len(noted := cells.loc[cells["fallbacks"].fillna("") != "", "fallbacks"]):
+        echo(f"{len(noted)} of {len(cells)} cells deviate from their algorithm (column fallbacks): {noted.iloc[0]}")
     counted = f"{len(rows)} cells, {f'{ok} ok, {len(rows) - ok} not ok' if ok < len(rows) else 'all ok'}"
     echo(counted + "; no check of constants, bounds and solvers failed" * (ok > 0 and not violated and not differ))
 

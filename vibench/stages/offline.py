@@ -86,6 +86,9 @@ class ConeStage(Stage):
         with faults_of(self.dual):
             cone, reducing = timed(lambda: strategy.reduce(snapshots, W, replace(self.stop)))
             cone = check_cone(cone, W, K)
+        if self.stop.tolerance and (error := float(cone.errors[-1])) > self.stop.tolerance:
+            missed = f"the cone misses its tolerance {self.stop.tolerance:g}: its error is {error:.2g}"
+            cone = replace(cone, fallbacks=(*cone.fallbacks, missed))
         prepared, preparing = timed(lambda: cone_basis(cone.generators, W, cone.free))
         orthogonal = orthogonality(cone.generators, W, cone.free)
         histories = History.of("cone", "error", cone.errors), History.of("cone", "e_orth", orthogonal)

@@ -76,9 +76,9 @@ def end_of_run(folder: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def test_a_run_of_which_no_cell_is_the_best_says_why(tmp_path: Path, main: Main, capsys: Captured) -> None:
-    """At the end of the run, and where the best cells are asked for; not for rows that were not asked for."""
-    end_of_run(tmp_path / "run", [row(f"c{k}", "broke") for k in range(21)])
-    said, *_, counted = capsys.readouterr().out.splitlines()
+    end_of_run(tmp_path / "run", [row(f"c{k}", "broke", fallbacks="one; two" * (k == 3)) for k in range(21)])
+    said, *_, noted, counted = capsys.readouterr().out.splitlines()
+    assert noted == "1 of 21 cells deviate from their algorithm (column fallbacks): one; two"
     assert "No model of this run takes part" in said
     assert counted == "21 cells, 0 ok, 21 not ok"
     out = succeeded(main("show", str(tmp_path / "run"), "--table", "best"))

@@ -50,7 +50,6 @@ def test_third_party_packages_have_new_interpreters(supervisor: Supervisor, monk
     monkeypatch.delenv("PYTHONHASHSEED", raising=False)
     first, second = (seen(supervisor, "hash('a')", owner="someone") for _ in range(2))
     assert first[:2] == second[:2] == [os.getpid(), False]
-    # Results that depend on the order of sets differ.
     assert first[2] != second[2]
     with contextlib.closing(Supervisor(environment={"PYTHONHASHSEED": "7"})) as seeded:
         assert seen(seeded)[1] is False

@@ -89,6 +89,8 @@ def test_histories_and_models_are_those_of_the_offline_stages(store: SampleStore
     added = {h.quantity: h.values for h in store.get(stage.key).histories}
     vectors = value_of(store, stage).vectors.shape[1]
     assert (len(pod["error"]), len(cone["e_orth"]) + 1) == (126, len(cone["error"]))
+    few = replace(stage.cone, stop=Stop(tolerance=1e-30)).run(store).value.cone
+    assert "misses its tolerance 1e-30" in few.fallbacks[-1]
     assert len(added["sigma"]) == len(added["beta_span_min"]) == vectors + 1
     own, full = np.array(added["beta_span_training"]), np.array(added["beta_full_span_training"])
     assert len(own) == len(full) == 125
