@@ -184,8 +184,9 @@ class Obstacle(Problem):
         return VariationalInequality(A=stiffness, f=self.load * areas, B=B, g=g)
 
     def start(self, mu: Array, nearest: Mask | None) -> Mask | NestedStart | None:  # noqa: ARG002
-        """The contact set of the nearest parameter; without one, on fine meshes, that of a coarser mesh."""
-        return self._on_coarser_mesh if nearest is None else nearest
+        """The contact set of the nearest parameter; without one, or by multigrid, on fine meshes, of a coarser mesh."""
+        # With multigrid a set that moves across the mesh, row by row, costs more than the coarser meshes.
+        return (self._on_coarser_mesh or nearest) if nearest is None or self.factorisation == "multigrid" else nearest
 
     @cached_property
     def _on_coarser_mesh(self) -> NestedStart | None:

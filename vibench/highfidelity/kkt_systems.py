@@ -87,6 +87,18 @@ class ActiveSolver(Protocol):
         """The u (c,) and λ (m,) with the active constraints as equalities; other multipliers are `fixed`, or vanish."""
 
 
+class Inexact(Protocol):
+    """An `ActiveSolver` by iteration."""
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the last solution is exact up to noise; others show only which set is next."""
+
+    @property
+    def noise(self) -> Array:
+        """Errors (m,) in B u that count as no violation."""
+
+
 class CondensedStiffness(Inverse):
     """A stiffness matrix A (n×n), sparse SPD, condensed on the unknowns that constraints involve.
 
@@ -341,6 +353,8 @@ class ActiveSetSystem:
     correct_eliminated: Callable[[Array], Array]
     beyond: Beyond | None = None
     K: DualSet = RAYS
+    # Says how accurate the solutions of an iteration are; `None` where all are exact.
+    inexact: Inexact | None = None
 
     def watching(self, rows: Mask) -> ActiveSetSystem:
         """Return this system, or one of a larger zone in which some rows (m,) are watched, too."""
@@ -354,6 +368,8 @@ class ActiveSetSystem:
         rows[active] = True
         system = self.watching(rows)
         u, lam = system.solve_active(active)
+        if system.inexact is not None:  # of a set that stays
+            u, lam = system.solve_active(active)
         return system.recover(u), lam
 
 

@@ -32,7 +32,8 @@ class _Empty(Factor):
 class Implementation(ABC):
     """A library that factorises without pivoting, with its `name` in studies and a line about it.
 
-    `distribution` is what it needs; "" if vibench needs that anyway. All methods raise a `NumericalError` that calls
+    `distribution` is what it needs; "" if vibench needs that anyway. One that `is_iterative` solves without a factor,
+    and proves no matrix to be definite. All methods raise a `NumericalError` that calls
     the matrix by a name if it is not positive definite.
     """
 
@@ -40,6 +41,7 @@ class Implementation(ABC):
     summary: ClassVar[str]
     distribution: ClassVar[str] = ""
     module: ClassVar[str] = __name__
+    is_iterative: ClassVar[bool] = False
 
     @cached_property
     def fault(self) -> str:
@@ -154,7 +156,23 @@ class CholmodFactor(Factor):
         return np.ascontiguousarray(np.array(solution).reshape(columns.shape)).reshape(right.shape)
 
 
-IMPLEMENTATIONS: dict[str, Implementation] = {one.name: one for one in (_SuperLU(), _Pardiso(), _Cholmod())}
+class _Multigrid(Implementation):
+    name, summary, distribution = "multigrid", "conjugate gradients with algebraic multigrid", "pyamg"
+    module, is_iterative = "pyamg", True
+
+    def _factor(self, matrix: SparseMatrix, name: str) -> Factor:
+        from vibench.linalg.multigrid import MultigridFactor  # noqa: PLC0415  an optional library
+
+        return MultigridFactor(matrix, name)
+
+    def eliminate(self, matrix: SparseMatrix, order: Indices, last: int, name: str) -> Elimination:
+        # A solution for every column of a Schur complement takes a factor.
+        return EliminationBySolutions(IMPLEMENTATIONS[DEFAULT], matrix, order, last, name)
+
+
+IMPLEMENTATIONS: dict[str, Implementation] = {
+    one.name: one for one in (_SuperLU(), _Pardiso(), _Cholmod(), _Multigrid())
+}
 DEFAULT: str = next(iter(IMPLEMENTATIONS))
 
 

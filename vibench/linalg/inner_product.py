@@ -126,6 +126,8 @@ class InnerProduct:
 
     def norm(self, u: Array) -> Array:
         """Norms of u (n,) as a scalar array, or of every column of u (n×k) as (k,)."""
+        if implementation(self.factorisation).is_iterative:
+            return np.asarray(np.sqrt(np.maximum(np.sum(u * self.apply(u), axis=0), 0.0)))
         return np.asarray(np.linalg.norm(self.whiten(u), axis=0))
 
     def riesz(self, functional: Array) -> Array:
@@ -147,6 +149,17 @@ class InnerProduct:
         """Coordinates F⁻ᵀ ℓ of the Riesz representer of ℓ (n,) or (n, k); Euclidean norms are dual norms."""
         self._refuse_others(functional)
         return self._factor.solve_factor_transposed(functional)
+
+    def coordinates(self, u: Array) -> tuple[Array, Callable[[Array], Array]]:
+        """Euclidean coordinates of columns u (n×k), and the map from coordinates to vectors in their span.
+
+        These are whitened ones, or, where that would be the only use of a factor, those of an orthonormal basis.
+        """
+        if not implementation(self.factorisation).is_iterative:
+            return self.whiten(u), self.unwhiten
+        self._refuse_others(u)
+        q, r = orthogonal_factorisation(self.matrix, u)
+        return r, lambda y: q @ y
 
     def orthonormalise(self, u: Array, against: Array | None = None) -> Array:
         """Orthonormal basis (n×r) of span(u), u (n×k), or of its part orthogonal to orthonormal `against` (n×l).

@@ -43,7 +43,10 @@ def is_proved_definite(parts: Sequence[SparseMatrix], chosen: Implementation, or
     implementations are only known to compute a Cholesky factorisation. If it succeeds for the computed D⁻¹XD⁻¹ − cI,
     D² being the diagonal of X, then X is definite. Here c is the sum of the round-off of summing and scaling and of the
     factorisation, Σ_j γ / (1 − γ) with γ_k of k = t_j + 1 and t_j entries in column j of the factor (Rump 2006, §2).
+    Iterations prove nothing.
     """
+    if chosen.is_iterative:
+        return False
     if chosen.name == DEFAULT:
         if (proved := _proved_by_band(parts)) is not None:
             return proved

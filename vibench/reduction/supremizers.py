@@ -92,13 +92,13 @@ class SpannedCoordinates:
     """
 
     def __init__(self, V: InnerProduct, basis: Array, vectors: Array) -> None:
-        self._V = V
-        self._whitened, self.represented = _beside(V.whiten(basis), V.whiten(vectors))
+        coordinates, self._vectors = V.coordinates(np.hstack([basis, vectors]))
+        self._whitened, self.represented = _beside(*np.split(coordinates, [basis.shape[1]], axis=1))
         self.plain: Array = np.eye(self._whitened.shape[1], basis.shape[1])
 
     def vectors(self, coordinates: Array) -> Array:
         """Vectors (n×k) with these coordinates (d×k)."""
-        return self._V.unwhiten(self._whitened @ coordinates)
+        return self._vectors(self._whitened @ coordinates)
 
 
 class ContactCoordinates:

@@ -332,7 +332,7 @@ class Study(_Model):
         default=FEWEST_ROUNDS,
         description="Minimal number of timing rounds, after which a cell with decided comparisons ends.",
     )
-    factorisation: Literal["superlu", "pardiso", "cholmod", "available"] = Field(
+    factorisation: Literal["superlu", "pardiso", "cholmod", "multigrid", "available"] = Field(
         default="superlu",
         description="Factorisation of high-fidelity matrices; a problem may have an option of the same name.",
     )

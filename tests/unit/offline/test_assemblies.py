@@ -59,7 +59,7 @@ def test_constants_are_those_of_the_default_whoever_factorises(name: str) -> Non
     for constant in ("coercivity_at", "continuity_at", "energy_inf_sup_at"):
         expected, found = (getattr(Assemblies(problem), constant)(mu) for problem in (plain, other))
         assert expected.proved
-        assert found.proved
+        assert found.proved is (constant == "energy_inf_sup_at" or not IMPLEMENTATIONS[name].is_iterative)
         assert found.value == pytest.approx(expected.value, rel=1e-6)
 
 
