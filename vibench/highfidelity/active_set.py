@@ -13,13 +13,11 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, Mask, SparseMatrix, read_only
 from vibench.errors import NumericalError, at_parameter
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness, condensed_stiffness
-from vibench.highfidelity.multigrid import MultigridStiffness
 from vibench.interfaces.dual_sets import BlockKind, DualSet, refuse_blocks
 from vibench.interfaces.problem import NestedStart, OfBox, Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly, in_float64, settled
 from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.linalg.factorisations import implementation
 from vibench.linalg.inner_product import InnerProduct, check_positive_definite, check_symmetric, factorised_later
 from vibench.linalg.schur_complement import FEW_PER_UNKNOWN, EliminationPattern
 from vibench.qp import verification
@@ -141,14 +139,13 @@ class HighFidelitySolver:
         if self._active:
             distances = np.linalg.norm((np.array(self._solved) - mu) / self._width, axis=1)
             nearest = self._active[int(np.argmin(distances))]
-        m = self._W.dim
         with factorised_later():
-            start = self._problem.start(mu.copy(), nearest)
-            if isinstance(start, NestedStart) and (self._coarse is None or self._coarse._problem is not start.coarse):
+            start, m = self._problem.start(mu.copy(), nearest), self._W.dim
+            if isinstance(start, NestedStart):
                 start.coarse.factorised_by(self._problem.factorisation)
-                self._coarse = HighFidelitySolver(start.coarse)
         if isinstance(start, NestedStart):
-            assert self._coarse is not None
+            if self._coarse is None or self._coarse._problem is not start.coarse:
+                self._coarse = HighFidelitySolver(start.coarse)
             # Remember nothing there: the start must depend on the parameter alone.
             coarse = self._coarse.solve_assembled(mu, checked_assembly(start.coarse, mu))
             return start.coarse.K.free(coarse.lam)[start.nearest]
@@ -171,10 +168,7 @@ class HighFidelitySolver:
             self._pattern, self._stiffness = self._elimination(vi), None
         if self._stiffness is None or "A" not in self._problem.constant:
             before, factorisation = self._stiffness, self._problem.factorisation
-            if implementation(factorisation).is_iterative:
-                self._stiffness = MultigridStiffness(vi.A, self._pattern, factorisation)
-            else:
-                self._stiffness = condensed_stiffness(vi.A, self._pattern, factorisation, before, vi.K)
+            self._stiffness = condensed_stiffness(vi.A, self._pattern, factorisation, before, vi.K)
         return self._stiffness
 
     def _elimination(self, vi: VariationalInequality) -> EliminationPattern:
@@ -242,7 +236,7 @@ def solve_unverified(
         (u, forces, iterations), fallback = _without_cycling(program, reading.equal, system)
     lam = reading.multipliers(forces, len(vi.g))
     # A large rigid displacement amplifies round-off in the eliminated unknowns; a stiff problem does so everywhere.
-    if system.inexact is None and _is_inaccurate(vi, u, lam):
+    if system.iterating is None and _is_inaccurate(vi, u, lam):
         u = u + system.correct_eliminated(vi.f - vi.A @ u - vi.B.T @ lam)
         if _is_inaccurate(vi, u, lam):
             u, lam = _refined(vi, stiffness, u, lam)
@@ -382,7 +376,7 @@ def active_set_iterations(
         except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
             return None
         forces, excess = weights * lam, B @ u - g
-        off = unit * (sizes @ np.abs(u) + np.abs(g)) + (0.0 if system.inexact is None else system.inexact.noise)
+        off = unit * (sizes @ np.abs(u) + np.abs(g)) + (system.iterating.noise if system.iterating else 0.0)
         violated = ~active & (excess > off)
         if system.beyond is not None:
             violated &= system.beyond.watched
@@ -398,7 +392,7 @@ def active_set_iterations(
             key = following.tobytes() + held.tobytes()
         else:
             held, changed, key = None, np.flatnonzero(following != active), following.tobytes()
-        if system.inexact is None or system.inexact.is_exact:
+        if system.iterating is None or system.iterating.is_exact:
             if not len(changed):
                 return u, lam, iteration
             if key in seen:

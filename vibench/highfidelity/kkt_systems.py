@@ -28,6 +28,7 @@ from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
 from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal, Factor
 from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.linalg.inner_product import check_regular
+from vibench.linalg.multigrid import MultigridFactor, NullSpaceSolver
 from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix, StaticCondensation
 from vibench.qp.scaling import peak, row_norms
 from vibench.qp.verification import Inverse, norms_by_solutions
@@ -85,18 +86,6 @@ class ActiveSolver(Protocol):
 
     def __call__(self, active: Indices, fixed: Array | None = None) -> tuple[Array, Array]:
         """The u (c,) and λ (m,) with the active constraints as equalities; other multipliers are `fixed`, or vanish."""
-
-
-class Inexact(Protocol):
-    """An `ActiveSolver` by iteration."""
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether the last solution is exact up to noise; others show only which set is next."""
-
-    @property
-    def noise(self) -> Array:
-        """Errors (m,) in B u that count as no violation."""
 
 
 class CondensedStiffness(Inverse):
@@ -314,6 +303,27 @@ class ZoneStiffness(CondensedStiffness):
         return ActiveSetSystem(B, vi.g, solver, recover, condensed.correct_eliminated, beyond)
 
 
+class MultigridStiffness(CondensedStiffness):
+    """A stiffness matrix A that is solved by multigrid, and condensed only where that is asked for."""
+
+    def _condense(self) -> None:
+        self._solver = MultigridFactor(self._A, "A")
+
+    def solve(self, right: Array) -> Array:
+        return self._solver.solve(right)
+
+    def check_definite(self, name: str) -> None:
+        pass  # as far as it is noticed, the solver has refused to be made
+
+    def dual_norms(self, functionals: Array) -> Array:
+        # The error of a norm is the square of that of the solution.
+        return norms_by_solutions(functionals, self._solver.solve_to(functionals, 1e-2))
+
+    def active_set_system(self, vi: VariationalInequality) -> ActiveSetSystem:
+        solver, nothing = NullSpaceSolver(self._A, vi.f, vi.B, vi.g), np.zeros(len(vi.f))
+        return ActiveSetSystem(sp.csr_array(vi.B), vi.g, solver, np.copy, lambda _: nothing, K=vi.K, iterating=solver)
+
+
 def condensed_stiffness(
     A: SparseMatrix, pattern: EliminationPattern, factorisation: str, before: CondensedStiffness | None = None,
     K: DualSet = RAYS,
@@ -323,6 +333,8 @@ def condensed_stiffness(
     `before` is the stiffness of another parameter of the problem, whose zone is the first one of this. Rows with an
     interval act everywhere: they have no zone.
     """
+    if implementation(factorisation).is_iterative:
+        return MultigridStiffness(A, pattern, factorisation)
     if not pattern.is_dense or len(pattern.interface) <= MANY_UNKNOWNS or K.blocks:
         return CondensedStiffness(A, pattern, factorisation)
     return ZoneStiffness(A, pattern, factorisation, before.zone if isinstance(before, ZoneStiffness) else None)
@@ -353,8 +365,8 @@ class ActiveSetSystem:
     correct_eliminated: Callable[[Array], Array]
     beyond: Beyond | None = None
     K: DualSet = RAYS
-    # Says how accurate the solutions of an iteration are; `None` where all are exact.
-    inexact: Inexact | None = None
+    # The solver, if its solutions are rough at first.
+    iterating: NullSpaceSolver | None = None
 
     def watching(self, rows: Mask) -> ActiveSetSystem:
         """Return this system, or one of a larger zone in which some rows (m,) are watched, too."""
@@ -368,7 +380,7 @@ class ActiveSetSystem:
         rows[active] = True
         system = self.watching(rows)
         u, lam = system.solve_active(active)
-        if system.inexact is not None:  # of a set that stays
+        if system.iterating is not None:  # a set that stays is solved exactly
             u, lam = system.solve_active(active)
         return system.recover(u), lam
 

@@ -32,9 +32,8 @@ class _Empty(Factor):
 class Implementation(ABC):
     """A library that factorises without pivoting, with its `name` in studies and a line about it.
 
-    `distribution` is what it needs; "" if vibench needs that anyway. One that `is_iterative` solves without a factor,
-    and proves no matrix to be definite. All methods raise a `NumericalError` that calls
-    the matrix by a name if it is not positive definite.
+    `distribution` is what it needs; "" if vibench needs that anyway. One that `is_iterative` proves nothing. All
+    methods raise a `NumericalError` that calls the matrix by a name if it is not positive definite.
     """
 
     name: ClassVar[str]
@@ -157,7 +156,7 @@ class CholmodFactor(Factor):
 
 
 class _Multigrid(Implementation):
-    name, summary, distribution = "multigrid", "conjugate gradients with algebraic multigrid", "pyamg"
+    name, summary, distribution = "multigrid", "conjugate gradients, multigrid", "pyamg"
     module, is_iterative = "pyamg", True
 
     def _factor(self, matrix: SparseMatrix, name: str) -> Factor:

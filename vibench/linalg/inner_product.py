@@ -151,10 +151,7 @@ class InnerProduct:
         return self._factor.solve_factor_transposed(functional)
 
     def coordinates(self, u: Array) -> tuple[Array, Callable[[Array], Array]]:
-        """Euclidean coordinates of columns u (n×k), and the map from coordinates to vectors in their span.
-
-        These are whitened ones, or, where that would be the only use of a factor, those of an orthonormal basis.
-        """
+        """Euclidean coordinates of u (n×k) and the map from them: whitened ones, by iteration those in span(u)."""
         if not implementation(self.factorisation).is_iterative:
             return self.whiten(u), self.unwhiten
         self._refuse_others(u)

@@ -10,16 +10,21 @@ from hypothesis import strategies as st
 from numerics import Varying, exact, spd
 from scipy.spatial import KDTree
 
-from vibench import Array, HighFidelitySolver, Mask, NestedStart, Reduction, Stop, create, solve_high_fidelity
+from vibench import Array, HighFidelitySolver, NestedStart, Reduction, Stop, create, solve_high_fidelity
 from vibench.errors import NumericalError
 from vibench.highfidelity import active_set, kkt_systems
-from vibench.highfidelity.kkt_systems import CondensedStiffness
+from vibench.highfidelity.kkt_systems import CondensedStiffness, MultigridStiffness
 from vibench.interfaces.problem import VariationalInequality
-from vibench.linalg.factorisations import DEFAULT
+from vibench.linalg.factorisations import DEFAULT, IMPLEMENTATIONS
+from vibench.linalg.multigrid import NullSpaceSolver
 from vibench.linalg.schur_complement import EliminationPattern
 from vibench.qp import kkt_residuals
+from vibench.reduction.pod import pod
 from vibench_problems import obstacle
 from vibench_problems.obstacle import Obstacle
+
+NEEDS_PYAMG = pytest.mark.skipif(not IMPLEMENTATIONS["multigrid"].is_installed, reason="needs pyamg")
+MADE = pytest.mark.parametrize("made", [CondensedStiffness, pytest.param(MultigridStiffness, marks=NEEDS_PYAMG)])
 
 
 def string(n: int, gap: float, load: float = 1.0) -> VariationalInequality:
@@ -34,8 +39,7 @@ def test_the_string_on_a_table_against_its_closed_form() -> None:
     """Contact from s on with s = √(2 gap/load); u = −gap + load (s − x)²/2 before; the multiplier is the load."""
     gap, load, n = 0.02, 1.0, 999
     solution = active_set.solve_high_fidelity(string(n, gap, load))
-    s = np.sqrt(2.0 * gap / load)
-    x = np.linspace(0.0, 1.0, n + 2)[1:-1]
+    s, x = np.sqrt(2.0 * gap / load), np.linspace(0.0, 1.0, n + 2)[1:-1]
     nearest = np.minimum(x, 1.0 - x)
     exact_u = np.where(nearest < s, -gap + 0.5 * load * (s - nearest) ** 2, -gap)
     assert np.abs(solution.u - exact_u).max() < 2e-6
@@ -49,8 +53,7 @@ def test_every_solution_is_that_of_the_right_active_set(seed: int) -> None:
     rng = np.random.default_rng(seed)
     vi = VariationalInequality(spd(7, rng), rng.standard_normal(7), rng.standard_normal((4, 7)), rng.random(4) * 0.2)
     sparse = VariationalInequality(sp.csc_array(vi.A), vi.f, sp.csr_array(vi.B), vi.g)
-    found = active_set.solve_high_fidelity(sparse)
-    x, alpha = exact(vi)
+    found, (x, alpha) = active_set.solve_high_fidelity(sparse), exact(vi)
     assert np.allclose(found.u, x, atol=1e-8)
     assert np.allclose(found.lam, alpha, atol=1e-7)
     assert found.residuals.worst <= 1e-10
@@ -59,8 +62,7 @@ def test_every_solution_is_that_of_the_right_active_set(seed: int) -> None:
 def test_kkt_conditions_hold_with_exact_zeros() -> None:
     problem = Varying()
     for mu in problem.training_set():
-        vi = problem.assemble(mu)
-        found = active_set.solve_high_fidelity(vi)
+        found = active_set.solve_high_fidelity(vi := problem.assemble(mu))
         assert np.abs(vi.A @ found.u + vi.B.T @ found.lam - vi.f).max() <= 1e-10 * np.abs(vi.f).max()
         assert np.all(found.lam >= 0.0)
         gap = vi.B @ found.u - vi.g
@@ -69,7 +71,8 @@ def test_kkt_conditions_hold_with_exact_zeros() -> None:
         assert 0 < np.count_nonzero(found.lam) < 8
 
 
-def test_a_cycling_active_set_is_helped_and_the_help_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+@MADE
+def test_a_cycling_active_set_is_helped_and_the_help_is_recorded(monkeypatch: pytest.MonkeyPatch, made: type) -> None:
     vi = string(50, 0.02)
     alone, iterate = active_set.solve_high_fidelity(vi), active_set.active_set_iterations
     assert alone.fallback == ""
@@ -79,7 +82,7 @@ def test_a_cycling_active_set_is_helped_and_the_help_is_recorded(monkeypatch: py
         return next(cycles_at_first, iterate(*given, **named))
 
     monkeypatch.setattr(active_set, "active_set_iterations", iterates)
-    helped = active_set.solve_high_fidelity(vi)
+    helped = active_set.solve_high_fidelity(vi, made(vi.A))
     assert "cycled" in helped.fallback
     assert np.allclose(helped.u, alone.u, atol=1e-12)
     assert np.array_equal(helped.lam == 0.0, alone.lam == 0.0)
@@ -116,12 +119,13 @@ SYSTEMS = [
 
 @pytest.mark.parametrize(("rows", "bound", "reason"), SYSTEMS)
 @pytest.mark.parametrize("whole", [True, False])
+@MADE
 def test_systems_that_cannot_be_regular_are_not_factorised(
-    rows: list, bound: float, reason: str, whole: bool, monkeypatch: pytest.MonkeyPatch
+    rows: list, bound: float, reason: str, whole: bool, made: type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """SuperLU took minutes for such systems, or destroyed the heap."""
     vi = replace(string(36, 0.0, -1.0), B=sp.csr_array(sp.vstack([sp.csr_array(part) for part in rows])))
-    stiffness = CondensedStiffness(vi.A, EliminationPattern.of_none(vi.A, DEFAULT) if whole else None)
+    stiffness = made(vi.A, EliminationPattern.of_none(vi.A, DEFAULT) if whole else None)
     vi, factorised, plain = replace(vi, g=np.full(vi.B.shape[0], bound)), [], kkt_systems.splu
     monkeypatch.setattr(kkt_systems, "splu", lambda matrix: factorised.append(matrix.shape[0]) or plain(matrix))
     if reason:
@@ -162,24 +166,23 @@ def test_a_contact_set_that_moves_node_by_node_is_followed_to_its_end() -> None:
     obstacle = -0.2 * (np.sin(np.pi * x) - np.sin(3.0 * np.pi * x)) - 0.5
     lumped = sp.diags_array(np.full(nodes, step)).tocsr()
     vi = VariationalInequality(0.05 * left + 0.15 * right, np.full(nodes, -step), -lumped, -step * obstacle)
-    found = active_set.solve_high_fidelity(vi)
-    assert found.iterations > 100
+    assert (found := active_set.solve_high_fidelity(vi)).iterations > 100
     assert found.fallback == ""
     assert np.all(found.u >= obstacle - 1e-12)
 
 
 @pytest.mark.parametrize("fraction", [1.0, 1e-4, 1e-8])
-def test_a_string_in_contact_is_as_accurate_beside_a_loaded_one(fraction: float) -> None:
+@MADE
+def test_a_string_in_contact_is_as_accurate_beside_a_loaded_one(fraction: float, made: type) -> None:
     """Its residuals are relative to what contact does, in x − A⁻¹f where round-off of the whole would hide them."""
     one = string(100, 0.03)
     alone, B = active_set.solve_high_fidelity(one), sp.csr_array(sp.hstack([one.B, 0.0 * one.B]))
     both = replace(one, A=sp.csr_array(sp.block_diag([one.A, one.A])), f=np.append(one.f, one.f / fraction), B=B)
-    beside = active_set.solve_high_fidelity(both)
+    beside = active_set.solve_high_fidelity(both, made(both.A))
     assert beside.residuals.worst <= 1e-10
     assert beside.residuals.unit == pytest.approx(alone.residuals.unit, rel=1e-9)
     assert np.allclose(beside.lam, alone.lam, rtol=1e-9)
-    hidden = kkt_residuals(both, beside.u, 2.0 * beside.lam)
-    assert hidden.worst > 0.1
+    assert kkt_residuals(both, beside.u, 2.0 * beside.lam).worst > 0.1
 
 
 class Crooked(Varying):
@@ -193,9 +196,7 @@ class Crooked(Varying):
 
 
 @pytest.mark.parametrize("constant", [frozenset(), frozenset({"A"})], ids=["varying", "constant"])
-def test_an_unsymmetric_stiffness_is_refused_and_where(
-    constant: frozenset[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unsymmetric_stiffness_is_refused(constant: frozenset[str], monkeypatch: pytest.MonkeyPatch) -> None:
     problem, mu = Crooked(), np.array([0.5])
     monkeypatch.setattr(Crooked, "constant", constant)
     with pytest.raises(NumericalError, match=r"^A is not symmetric"):
@@ -257,21 +258,44 @@ def test_coarser_meshes_save_iterations_and_change_no_solution(monkeypatch: pyte
         distances, _ = KDTree(places(fine)[:, others].T).query(places(fine)[:, wrong].T)
         assert np.max(distances, initial=0.0) < 1.5 * spacing
     fine.start = lambda mu, nearest: nested  # type: ignore[method-assign]
-    found = HighFidelitySolver(fine).solve(MU)
-    assert found.iterations < 0.6 * cold.iterations
+    assert (found := HighFidelitySolver(fine).solve(MU)).iterations < 0.6 * cold.iterations
     assert found.fallback == ""
     assert np.array_equal(found.lam > 0.0, cold.lam > 0.0)
     assert np.allclose(found.u, cold.u, rtol=0.0, atol=1e-12)
     cold = HighFidelitySolver(Obstacle(1500)).solve(MU)
     monkeypatch.setattr(obstacle, "NESTED", 1000)
     problem = Obstacle(1500)
-    solver = HighFidelitySolver(problem)
-    first = solver.solve(MU)
+    first = (solver := HighFidelitySolver(problem)).solve(MU)
     assert first.iterations < cold.iterations
     assert np.allclose(first.u, cold.u, rtol=0.0, atol=1e-12)
     nearest = first.lam > 0.0
     assert problem.start(MU, nearest) is nearest
     assert solver.solve(MU).iterations == 1  # from its own contact set
+
+
+@NEEDS_PYAMG
+def test_by_multigrid_most_sets_are_solved_roughly_and_no_matrix_is_factorised(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(obstacle, "NESTED", 1500)
+    default, made = Obstacle(1600, ceiling=0.012), {"resolution": 1600, "ceiling": 0.012, "factorisation": "multigrid"}
+    problem = create("problem", "obstacle", made)
+    problem.V.__dict__["_factor"] = None
+    (solver, exact), shares, V = map(HighFidelitySolver, (problem, default)), list[float](), default.V
+    solve = NullSpaceSolver.__call__
+    monkeypatch.setattr(NullSpaceSolver, "__call__", lambda self, *a: (solve(self, *a), shares.append(self._share))[0])
+    for mu in problem.parameters.sample(2, 0):
+        found, expected = solver.solve(mu), exact.solve(mu)
+        assert V.norm(found.u - expected.u) <= 1e-9 * V.norm(expected.u)
+        assert np.array_equal(found.lam > 0.0, expected.lam > 0.0)
+    assert sum(share > 1e-9 for share in shares) >= len(shares) / 2
+    assert solver._coarse._problem.factorisation == "multigrid"
+    assert isinstance(problem.start(mu, found.lam > 0.0), NestedStart)  # although there is a nearest set
+    force = (A := problem.assemble(mu).A) @ found.u
+    assert solver._stiffness.dual_norms(force[:, None]) == pytest.approx(np.sqrt(found.u @ A @ found.u), rel=1e-3)
+    snapshots = np.random.default_rng(0).standard_normal((V.dim, 6)) * 10.0 ** -np.arange(6)
+    ours, theirs = (pod(snapshots, X, Stop(size=5)) for X in (problem.V, V))
+    assert np.allclose(ours.errors, theirs.errors, rtol=1e-10)
+    assert np.allclose(np.abs(V.gram(ours.basis, theirs.basis)), np.eye(5), atol=1e-10)
+    assert np.allclose(problem.V.norm(snapshots), V.norm(snapshots), rtol=1e-12)
 
 
 def test_a_start_depends_on_the_parameter_alone_and_can_be_copied_after_use() -> None:
@@ -285,10 +309,9 @@ def test_a_start_depends_on_the_parameter_alone_and_can_be_copied_after_use() ->
     assert np.array_equal(pickle.loads(pickle.dumps(nested)).nearest, nested.nearest)
 
 
-@pytest.mark.parametrize("start", [np.zeros(3, bool), np.zeros(100)], ids=["too short", "not of booleans"])
-def test_a_start_of_the_wrong_kind_is_named(start: Mask) -> None:
+def test_a_start_of_the_wrong_kind_is_named() -> None:
     problem = Obstacle(400)
-    problem.start = lambda mu, nearest: start  # type: ignore[method-assign]
-    expected = rf"start returns .*; expected truth values \({problem.W.dim},\), a NestedStart, or None"
-    with pytest.raises(NumericalError, match=expected):
-        HighFidelitySolver(problem).solve(MU)
+    for start in (np.zeros(3, bool), np.zeros(problem.W.dim)):  # too short, not of booleans
+        problem.start = lambda mu, nearest, start=start: start  # type: ignore[method-assign]
+        with pytest.raises(NumericalError, match=rf"start returns .* \({problem.W.dim},\), a NestedStart, or None"):
+            HighFidelitySolver(problem).solve(MU)

@@ -87,10 +87,8 @@ def test_one_factorisation_per_parameter_solves_and_verifies(monkeypatch: pytest
     """Where A varies and few rows constrain: nothing else is factorised, and residuals are those of a factor of A."""
     problem = Obstacle("medium")
     first, second = problem.parameters.sample(2, 3)
-    solver = HighFidelitySolver(problem)
-    start = solver.solve(first).lam > 0.0
-    made = []
-    lu = cholesky.symmetric_lu
+    start = (solver := HighFidelitySolver(problem)).solve(first).lam > 0.0
+    made, lu = [], cholesky.symmetric_lu
     monkeypatch.setattr(kkt_systems, "symmetric_lu", lambda matrix, order: made.append(order) or lu(matrix, order))
     monkeypatch.setattr(kkt_systems, "splu", None)
     monkeypatch.setattr(cholesky, "_pivots", None)
@@ -162,8 +160,7 @@ def test_solutions_do_not_depend_on_the_zone(hertz: Hertz, rows: int | None, con
     guess = None if rows is None else lambda factor, vi: np.arange(len(vi.g)) < rows
     with mock.patch.multiple(kkt_systems, MANY_UNKNOWNS=0, coarse_contact=guess or kkt_systems.coarse_contact):
         with mock.patch.object(Hertz, "constant", frozenset({"A", "f"} if constant else ())):
-            solver = HighFidelitySolver(hertz)
-            zones = []
+            solver, zones = HighFidelitySolver(hertz), []
             for mu, single in zip(mus, expected, strict=True):
                 found = solver.solve(mu)
                 assert isinstance(solver._stiffness, ZoneStiffness)

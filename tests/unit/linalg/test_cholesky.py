@@ -15,18 +15,21 @@ from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination
 from vibench.linalg.definite import BlockDiagonal, connected_blocks
 
 
+def check_factor(factor: SparseCholesky | PartialCholesky, X: np.ndarray, r: np.ndarray) -> None:
+    F = factor.apply_factor(np.eye(len(X)))
+    assert np.allclose(F.T @ F, X)
+    assert np.allclose(F[:, factor.order], np.triu(F[:, factor.order]))
+    assert np.allclose(factor.solve_factor(r), np.linalg.solve(F, r))
+    assert np.allclose(factor.solve_factor_transposed(r), np.linalg.solve(F.T, r))
+
+
 @given(st.integers(0, 10_000))
 def test_the_factor_is_upper_triangular_in_its_order_and_gives_the_matrix(seed: int) -> None:
     rng = np.random.default_rng(seed)
     X = spd(7, rng)
-    factor = pickle.loads(pickle.dumps(SparseCholesky(sp.csc_array(X))))
-    F = factor.apply_factor(np.eye(7))
-    assert np.allclose(F.T @ F, X)
-    assert np.allclose(F[:, factor.order], np.triu(F[:, factor.order]))
-    r = rng.standard_normal((7, 2))
+    factor, r = pickle.loads(pickle.dumps(SparseCholesky(sp.csc_array(X)))), rng.standard_normal((7, 2))
     assert np.allclose(factor.solve(r), np.linalg.solve(X, r))
-    assert np.allclose(factor.solve_factor(r), np.linalg.solve(F, r))
-    assert np.allclose(factor.solve_factor_transposed(r), np.linalg.solve(F.T, r))
+    check_factor(factor, X, r)
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
@@ -37,9 +40,7 @@ def test_many_right_hand_sides_are_solved_as_few_are(order: str) -> None:
         whole, partial = SparseCholesky(sp.csc_array(X)), PartialCholesky(sp.csc_array(X), np.arange(9), 2)
         assert np.allclose(whole.solve(r), np.linalg.solve(X, r))
         for factor in (whole, partial):
-            F = factor.apply_factor(np.eye(9))
-            assert np.allclose(factor.solve_factor(r), np.linalg.solve(F, r))
-            assert np.allclose(factor.solve_factor_transposed(r), np.linalg.solve(F.T, r))
+            check_factor(factor, X, r)
         assert np.allclose(partial.eliminate(r)[0], np.linalg.solve(X[:7, :7], r[:7]))
         assert np.allclose(partial.extend(r[:2]), np.vstack([-np.linalg.solve(X[:7, :7], X[:7, 7:] @ r[:2]), r[:2]]))
 
@@ -55,22 +56,14 @@ def partly_eliminated(seed: int, count: int, bodies: bool) -> tuple[np.ndarray, 
 
 
 @given(st.integers(0, 10_000), st.integers(0, 9), st.booleans(), st.integers(0, 3))
-def test_partial_factors_give_matrix_schur_complement_and_unknowns(
-    seed: int, count: int, bodies: bool, columns: int
-) -> None:
+def test_partial_factors_give_matrix_and_unknowns(seed: int, count: int, bodies: bool, columns: int) -> None:
     X, last, factor = partly_eliminated(seed, count, bodies)
-    F = factor.apply_factor(np.eye(9))
-    assert np.allclose(F.T @ F, X)
     assert np.array_equal(factor.order[9 - count :], last)
-    assert np.allclose(F[:, factor.order], np.triu(F[:, factor.order]))
-    y = np.random.default_rng(seed).standard_normal((9, columns) if columns else 9)
-    assert np.allclose(factor.solve_factor(y), np.linalg.solve(F, y))
-    assert np.allclose(factor.solve_factor_transposed(y), np.linalg.solve(F.T, y))
+    check_factor(factor, X, np.random.default_rng(seed).standard_normal((9, columns) if columns else 9))
     rest = np.setdiff1d(np.arange(9), last)
     taken = X[np.ix_(last, rest)] @ np.linalg.solve(X[np.ix_(rest, rest)], X[np.ix_(rest, last)])
     S, F = X[np.ix_(last, last)] - taken, factor.trailing_factor
-    assert np.allclose(factor.schur_blocks().toarray(), S)
-    assert np.allclose(F.T @ F, S)
+    assert np.allclose([factor.schur_blocks().toarray(), F.T @ F], S)
     assert np.array_equal(F, np.triu(F))
     rng = np.random.default_rng(seed)
     given_there = rng.standard_normal((count, columns) if columns else count)
@@ -114,8 +107,7 @@ def test_what_is_not_positive_definite_is_refused_by_name() -> None:
 
 def mixed_blocks(seed: int, sizes: list[int]) -> tuple[np.ndarray, list[set[int]]]:
     """A matrix of blocks whose unknowns are mixed, and the unknowns of each."""
-    rng = np.random.default_rng(seed)
-    count = sum(sizes)
+    rng, count = np.random.default_rng(seed), sum(sizes)
     place, block = rng.permutation(count), scipy.linalg.block_diag(np.zeros((0, 0)), *(spd(k, rng) for k in sizes))
     X = np.zeros((count, count))
     X[np.ix_(place, place)] = block
@@ -129,8 +121,7 @@ def test_factor_and_inverse_are_those_of_the_whole_matrix(seed: int, sizes: list
     matrix, rng = BlockDiagonal.of(X), np.random.default_rng(seed)
     assert np.array_equal(matrix.toarray(), X)
     factor, inverse = matrix.cholesky("X"), matrix.inverse("X")
-    F = factor.toarray()
-    assert np.allclose(F.T @ F, X)
+    assert np.allclose((F := factor.toarray()).T @ F, X)
     assert np.array_equal(F, np.triu(F))
     assert np.allclose(inverse.toarray() @ X, np.eye(len(X)))
     assert np.array_equal(inverse.toarray(), inverse.toarray().T)
@@ -147,8 +138,7 @@ def test_values_that_are_mostly_zero_have_the_products_of_others(seed: int, size
     X, _ = mixed_blocks(seed, sizes)
     matrix, rng = BlockDiagonal.of(X), np.random.default_rng(seed)
     for shape in ((len(X),), (len(X), 2)):
-        values = np.zeros(shape)
-        chosen = rng.permutation(len(X))[:acting]
+        values, chosen = np.zeros(shape), rng.permutation(len(X))[:acting]
         values[chosen] = rng.standard_normal((len(chosen), *shape[1:]))
         assert np.allclose(matrix.times_sparse(values), X @ values)
 

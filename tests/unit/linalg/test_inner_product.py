@@ -29,8 +29,7 @@ def test_whitening_carries_the_inner_product_and_riesz_representers_represent(se
 
 @given(seeds)
 def test_orthonormalisation_keeps_the_span_and_leaves_out_what_is_there(seed: int) -> None:
-    X = space(15, seed)
-    rng = np.random.default_rng(seed)
+    X, rng = space(15, seed), np.random.default_rng(seed)
     first = X.orthonormalise(rng.standard_normal((15, 4)))
     added = X.orthonormalise(np.hstack([rng.standard_normal((15, 3)), first]), first)
     Z = np.hstack([first, added])
@@ -73,8 +72,7 @@ def test_what_is_no_inner_product_is_refused_at_once_or_later() -> None:
 def test_range_has_the_rank_of_its_vectors(seed: int, rank: int) -> None:
     rng = np.random.default_rng(seed)
     y = rng.standard_normal((12, rank)) @ rng.standard_normal((rank, 9))
-    q = orthonormal_range(y)
-    assert q.shape == (12, rank)
+    assert (q := orthonormal_range(y)).shape == (12, rank)
     assert np.allclose(q.T @ q, np.eye(rank), atol=1e-13)
     assert np.allclose(q @ (q.T @ y), y, atol=1e-12 * np.abs(y).max())
 
@@ -82,18 +80,15 @@ def test_range_has_the_rank_of_its_vectors(seed: int, rank: int) -> None:
 def test_ranges_drop_duplicates_and_are_orthogonal_to_a_given_space() -> None:
     e = np.eye(6)
     y = np.column_stack([e[0], e[0], np.zeros(6), 1e-9 * e[1], e[0] + 1e-15 * e[2]])
-    q = orthonormal_range(y)
-    assert q.shape[1] == 2
+    assert (q := orthonormal_range(y)).shape[1] == 2
     assert np.allclose(np.abs(q.T @ e[:, :2]), np.eye(2), atol=1e-9)
     rng = np.random.default_rng(1)
     fixed, _ = np.linalg.qr(rng.standard_normal((20, 5)))
     nearly = fixed @ rng.standard_normal((5, 3)) + 1e-8 * rng.standard_normal((20, 3))
     inside = fixed @ rng.standard_normal((5, 2))
-    q = orthonormal_range(np.hstack([nearly, inside]), fixed)
-    assert q.shape[1] == 3
+    assert (q := orthonormal_range(np.hstack([nearly, inside]), fixed)).shape[1] == 3
     assert np.abs(fixed.T @ q).max() < 1e-14
     assert np.allclose(q.T @ q, np.eye(3), atol=1e-13)
-    y = rng.standard_normal((20, 2))
-    rest = project_out(fixed, y)
+    rest = project_out(fixed, y := rng.standard_normal((20, 2)))
     assert np.abs(fixed.T @ rest).max() < 1e-15
     assert np.allclose(fixed @ (fixed.T @ y) + rest, y)

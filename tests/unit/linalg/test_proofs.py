@@ -59,8 +59,7 @@ def test_the_error_of_a_factorisation_is_bounded(seed: int, n: int) -> None:
     matrix, scale = spd(n, rng, spread=1e6), rng.uniform(0.5, 2.0, n)
     lu = symmetric_lu(sp.csc_array(matrix), "MMD_AT_PLUS_A")
     lower, pivots = lu.L.toarray(), lu.U.diagonal()
-    back = np.argsort(lu.perm_c)
-    bound = proofs._factorisation_error(lu, 1.0 / scale)
+    back, bound = np.argsort(lu.perm_c), proofs._factorisation_error(lu, 1.0 / scale)
     for i in range(n):
         total = Fraction(0)
         for j in range(n):

@@ -46,8 +46,7 @@ def test_retained_unknowns_alone_have_columns() -> None:
     A, retained = sparse_spd(12, np.random.default_rng(3)), np.array([2, 3, 7, 11])
     pattern, B = EliminationPattern.of(A, retained), np.zeros((3, 12))
     B[[0, 0, 2], [7, 2, 11]] = 1.0, 2.0, 3.0
-    given_rows = sp.csr_array(B)
-    found = pattern.on_retained(given_rows)
+    found = pattern.on_retained(given_rows := sp.csr_array(B))
     assert np.array_equal(found.toarray(), B[:, retained])
     found.data[:] = 0.0
     assert np.array_equal(given_rows.toarray(), B)

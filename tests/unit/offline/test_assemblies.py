@@ -60,7 +60,7 @@ def test_constants_are_those_of_the_default_whoever_factorises(name: str) -> Non
         expected, found = (getattr(Assemblies(problem), constant)(mu) for problem in (plain, other))
         assert expected.proved
         assert found.proved is (constant == "energy_inf_sup_at" or not IMPLEMENTATIONS[name].is_iterative)
-        assert found.value == pytest.approx(expected.value, rel=1e-6)
+        assert found.value == pytest.approx(expected.value, rel=1e-6 if found.proved else 1e-3)
 
 
 def test_factors_and_parameters_are_kept_as_they_fit() -> None:
