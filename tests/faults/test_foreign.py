@@ -23,7 +23,7 @@ LIBRARIES = {
     "scs": "raise KeyError", "ecos": "this is no Python", "highspy": "raise ImportError('built for another NumPy')",
     "mosek": "[][0]", "osqp": "import no_such_module", "quadprog": "assert not 'supported'",
     "gurobipy": "raise RuntimeError('no licence')", "qpalm": "raise Exception", "copt": "undefined",
-    "qpoases": "raise RecursionError", "nppro": "raise TypeError",
+    "qpoases": "raise RecursionError", "nppro": "raise TypeError", "pyamg": "raise OSError",
     "pypardiso": "raise SystemExit", "sklearn": "raise ValueError('numpy.dtype size changed')",
     "distributed": "raise AttributeError", "matplotlib": "raise ValueError('Key backend')", "h5py": "raise OSError",
 }  # fmt: skip
@@ -56,7 +56,7 @@ assert implementation("available").name == "superlu"
 assert not reason("piqp") and not reason("proxqp")
 assert solve_qp(wire(), "piqp", 1e-7).x is not None
 print(json.dumps(said | {
-    "cholmod": reason("piqp", "cholmod"), "pypardiso": reason("piqp", "pardiso"),
+    "cholmod": reason("piqp", "cholmod"), "pypardiso": reason("piqp", "pardiso"), "pyamg": reason("piqp", "multigrid"),
     "distributed": line(lambda: Dask(None, 1, Path())),
     "matplotlib": line(lambda: object.__new__(Run).figure("errors")),
     "h5py": line(lambda: ArrayFiles(Path(), 0, 1)._hdf5(Path(), "A")),

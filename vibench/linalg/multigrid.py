@@ -60,7 +60,10 @@ def _cycle(matrix: SparseMatrix, name: str) -> Product:
 
     def cycle(residual: Array) -> Array:
         size = float(np.max(np.abs(residual))) or 1.0  # residuals of a converged solution would underflow
-        return np.asarray(product((residual / size).astype(np.float32)), float) * (size / unit)
+        try:
+            return np.asarray(product((residual / size).astype(np.float32)), float) * (size / unit)
+        except RuntimeError as error:  # of the factorisation on the coarsest level
+            raise NumericalError(f"{name} has no multigrid hierarchy, as of one scalar field: {error}") from None
 
     return cycle
 
@@ -86,7 +89,7 @@ def solution(apply: Product, cycle: Product, right: Array, start: Array, goal: f
         x = daxpy(direction, x, a=square / curvature)
         # The residual that is updated falls far below that of x, which round-off bounds.
         residual = daxpy(image, residual, a=-square / curvature) if step % 8 else right - apply(x)
-    raise NumericalError(f"{name}: conjugate gradients stop at {last**0.5:.1e}, above {goal:.1e}")
+    raise NumericalError(f"{name}: multigrid of scalar fields stops at {last**0.5:.1e}, above {goal:.1e}")
 
 
 class NullSpaceSolver:
