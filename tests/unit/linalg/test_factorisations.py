@@ -38,8 +38,7 @@ def condensed(A: np.ndarray, last: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("weight", [1e-9, 2e11])
 def test_solutions_and_schur_complements_are_dense_ones(chosen: Implementation, sizes: Sizes, weight: float) -> None:
     A, rng = membranes(sizes, weight), np.random.default_rng(0)
-    n, dense = A.shape[0], A.toarray()
-    factor = chosen.factorise(A, "A")
+    n, dense, factor = A.shape[0], A.toarray(), chosen.factorise(A, "A")
     for right in (rng.standard_normal(n), rng.standard_normal((n, 3)), np.zeros((n, 0)), np.zeros(n)):
         np.testing.assert_allclose(factor.solve(right), np.linalg.solve(dense, right), atol=1e-12 / weight)
     last = np.concatenate([np.arange(5), np.arange(n - 4, n)])
@@ -52,8 +51,7 @@ def test_solutions_and_schur_complements_are_dense_ones(chosen: Implementation, 
         u = partly.extend(values)
         np.testing.assert_array_equal(u[last], values)
         np.testing.assert_allclose((dense @ u)[order[:-9]], 0.0, atol=1e-12 * weight)
-    right = rng.standard_normal((n, 2))
-    solved, load = partly.eliminate(right)
+    solved, load = partly.eliminate(right := rng.standard_normal((n, 2)))
     np.testing.assert_allclose(load, schur.toarray() @ np.linalg.solve(dense, right)[last], atol=1e-11)
     np.testing.assert_allclose(dense[np.ix_(order[:-9], order[:-9])] @ solved, right[order[:-9]], atol=1e-11)
 

@@ -24,16 +24,14 @@ def test_equilibrium_with_given_retained_unknowns(seed: int, count: int) -> None
     retained = np.sort(rng.permutation(12)[:count])
     others = np.setdiff1d(np.arange(12), retained)
     condensed = StaticCondensation(A, EliminationPattern.of(A, retained))
-    dense = A.toarray()
-    inner = np.linalg.inv(dense[np.ix_(others, others)])
+    inner = np.linalg.inv((dense := A.toarray())[np.ix_(others, others)])
     taken = dense[np.ix_(retained, others)] @ inner
     schur = dense[np.ix_(retained, retained)] - taken @ dense[np.ix_(others, retained)]
     assert np.allclose(condensed.schur.toarray(), schur)
     load, particular = condensed.condense_load(f)
     assert np.allclose(load, f[retained] - taken @ f[others])
     assert np.allclose(condensed.condense_load(2.0 * f)[0], 2.0 * load)  # not that of the load before
-    u_retained = rng.standard_normal(count)
-    u = condensed.recover(u_retained, particular)
+    u = condensed.recover(u_retained := rng.standard_normal(count), particular)
     assert np.allclose(u[retained], u_retained)
     assert np.allclose((dense @ u - f)[others], 0.0, atol=1e-10)
     disturbed = u + rng.standard_normal(12) * np.isin(np.arange(12), others)
