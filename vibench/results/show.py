@@ -45,10 +45,9 @@ def _views() -> dict[str, View]:
         "queries_ok", "N", "R", "status", "beta_span_min", "enrichment",
     )  # fmt: skip
     of_break_even = (
-        "problem", "formulation_a", "formulation_b", "dual", "primal_a", "primal_b", "benefit_threshold",
-        "primal_tol_b", "solver", "assembly_a", "bounds_a", "assembly_b", "bounds_b", "correction", "threshold_high",
-        "gain", "rounds_missing",
-        "pod_tol", "dual_tol", "accuracy", "online_b_s", "online_a_s", "offline_b_s", "offline_a_s",
+        "problem", "formulation_b", "dual", "primal_b", "primal_tol_b", "primal_a", "benefit_threshold", "gain",
+        "threshold_high", "online_b_s", "formulation_a", "solver", "assembly_b", "bounds_b", "assembly_a", "bounds_a",
+        "correction", "rounds_missing", "pod_tol", "dual_tol", "accuracy", "online_a_s", "offline_b_s", "offline_a_s",
     )  # fmt: skip
     of_queries = (
         *AXES, "cell", "query", "status", "error_u", "error_lambda", "total_s", "mu_1", "mu_2", "mu_3",

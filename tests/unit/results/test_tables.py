@@ -169,9 +169,9 @@ def test_values_are_printed_with_three_digits_and_the_benefits_say_from_when_on_
     a = CELL | {"cell": "a", "enrichment_kind": "per-parameter", "primal": "varying", "online_s": 0.004, "hf_s": 0.1}
     b = CELL | {"cell": "b", "enrichment_kind": "fixed", "primal": "fixed", "offline_s": 2.5, "hf_s": 0.1}
     frame = break_even_table(pd.DataFrame(break_even_rows([a, b], rounds([a, b])), columns=list(STORED["thresholds"])))
-    paired = frame[(frame["a"] == "varying") & (frame["b"] == "fixed")].iloc[0]
+    paired = frame[(frame["against"] == "varying") & (frame["model"] == "fixed")].iloc[0]
     assert paired["break-even"] == f"from {(2.5 - 1.5) / (0.004 - 0.0025):.0f}"
-    assert (paired["offline a [s]"], paired["online a [ms]"], paired["online b [ms]"]) == pytest.approx((1.5, 4.0, 2.5))
+    assert list(paired[["offline against [s]", "online against [ms]", "online [ms]"]]) == pytest.approx([1.5, 4.0, 2.5])
     low, high = map(int, paired["interval"].split("–"))
     assert low < 1 / 0.0015 < high
     assert len(frame) == 3
