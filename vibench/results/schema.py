@@ -372,7 +372,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "assembly_b": text("Assembly of the queries of b.", "assembly", 14),
         "bounds_b": integer("1 if the queries of b have bounds.", "bounds", 14),
         "offline_a_s": real("s", "Offline seconds of a.", "offline against [s]", 18),
-        "online_a_s": real("s", "Seconds of a query of a, in the blocks of rounds both share.", "online against [ms]", 18),
+        "online_a_s": real("s", "Seconds of a query of a, in the rounds both share.", "online against [ms]", 18),
         "offline_b_s": real("s", "Offline seconds of b.", "offline [s]", 16),
         "online_b_s": real("s", "Seconds of a query of b, in these blocks.", "online [ms]", 17),
         "gain": real("1", "Seconds of a query of a divided by those of b, paired within rounds.", "gain", 19),
