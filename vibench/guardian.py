@@ -26,10 +26,8 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 
 def new_environment() -> dict[str, str]:
     """The environment of a new process on one thread, with the path of this one and a new `MARK`."""
-    # With these (bytes) glibc keeps up to 1 GiB of freed memory: large arrays are not mapped anew page by page.
-    memory = {"MMAP_THRESHOLD": "33554432", "TRIM_THRESHOLD": "1073741824", "TOP_PAD": "67108864"}
-    environment = os.environ | ONE_THREAD | {f"MALLOC_{name}_": size for name, size in memory.items()}
-    return environment | {MARK: secrets.token_hex(8), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    path = os.pathsep.join(filter(None, sys.path))
+    return os.environ | ONE_THREAD | {MARK: secrets.token_hex(8), "PYTHONPATH": path}
 
 
 def guarded(module: str, *arguments: str, environment: Mapping[str, str]) -> dict[str, Any]:

@@ -179,7 +179,7 @@ def main() -> None:
                 os.close(key.fd)
                 pid, client = key.data
                 told = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-            with contextlib.suppress(BrokenPipeError):
+            with contextlib.suppress(OSError):  # the client may have been killed
                 client.sendall(struct.pack("q", told))
             if number is not listener:
                 client.close()

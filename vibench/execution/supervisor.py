@@ -23,8 +23,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from vibench.execution.forking import Forked, fork_worker
-from vibench.guardian import MARK, guarded, kill_marked, new_environment
+from vibench.execution.forking import Forked, fork_worker, worker_environment
+from vibench.guardian import MARK, guarded, kill_marked
 from vibench.provenance import libraries, numerical_code
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, ItemwiseStage, Stage, Unstored
@@ -325,7 +325,7 @@ class Supervisor:
     def _worker(self, packages: frozenset[str]) -> _Worker:
         """The worker process of some packages, started if there is none."""
         if packages not in self._workers:
-            (ours, theirs), environment = socket.socketpair(), {**new_environment(), **self._environment}
+            (ours, theirs), environment = socket.socketpair(), {**worker_environment(), **self._environment}
             # Two interpreters have two orders of sets, which shows whether results of a package depend on it.
             forks = not packages and not self._environment
             with theirs, tempfile.TemporaryFile() as shared:
