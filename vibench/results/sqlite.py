@@ -158,7 +158,11 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
             connection = stack.enter_context(contextlib.closing(connect(copy, "ro")))
         connection.execute("PRAGMA trusted_schema=OFF")
         connection.text_factory = text_reader()
-        yield connection
+        try:
+            yield connection
+        except UnicodeDecodeError as error:
+            # Python decodes what SQLite says of a damaged schema, which may quote any bytes of it.
+            raise DamagedResultsError(f"'{path}' is damaged: {error}") from None
 
 
 def connect(path: Path, mode: Literal["ro", "rwc"]) -> sqlite3.Connection:
