@@ -146,12 +146,14 @@ def _triangulate_around(
     for _ in range(SMOOTHING_SWEEPS):
         smooth = _smoothed(smooth, triangles, fixed)
     if not _are_delaunay(smooth, _quadrilaterals(triangles)):
-        # The lattice is so regular that this is rare; on large meshes a dozen edges of millions differ.
-        sweeps, smooth = (SMOOTHING_SWEEPS, points) if len(points) < 100_000 else (0, smooth)
-        for _ in range(sweeps):
-            smooth = _smoothed(smooth, triangles, fixed)
+        # The lattice is so regular that this is rare.
+        if len(points) < 100_000:
+            smooth = points
+            for _ in range(SMOOTHING_SWEEPS):
+                smooth = _smoothed(smooth, triangles, fixed)
+                triangles = _delaunay_annulus(smooth, used, radius)
+        else:  # a dozen edges of millions differ
             triangles = _delaunay_annulus(smooth, used, radius)
-        triangles = triangles if sweeps else _delaunay_annulus(smooth, used, radius)
     points = smooth
     ring = np.sort(np.column_stack([circle, np.roll(circle, -1)]), axis=1)
     edges = np.sort(np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)

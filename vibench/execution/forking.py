@@ -46,7 +46,7 @@ class Forked:
         self.pid = pid
 
     def _number(self) -> int:
-        # A server that has ended has taken its processes with it.
+        # Of a server that was killed nothing is heard; its processes are given up.
         content = self._status.recv(8)
         return int(struct.unpack("q", content)[0]) if content else -signal.SIGKILL
 

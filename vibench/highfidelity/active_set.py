@@ -141,11 +141,11 @@ class HighFidelitySolver:
             nearest = self._active[int(np.argmin(distances))]
         with factorised_later():
             start, m = self._problem.start(mu.copy(), nearest), self._W.dim
-            if isinstance(start, NestedStart):
+            if isinstance(start, NestedStart) and (self._coarse is None or self._coarse._problem is not start.coarse):
                 start.coarse.factorised_by(self._problem.factorisation)
-        if isinstance(start, NestedStart):
-            if self._coarse is None or self._coarse._problem is not start.coarse:
                 self._coarse = HighFidelitySolver(start.coarse)
+        if isinstance(start, NestedStart):
+            assert self._coarse is not None
             # Remember nothing there: the start must depend on the parameter alone.
             coarse = self._coarse.solve_assembled(mu, checked_assembly(start.coarse, mu))
             return start.coarse.K.free(coarse.lam)[start.nearest]

@@ -18,6 +18,7 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError, RequestError, UnsupportedError, foreign, unknown_name
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
 from vibench.linalg.definite import BlockDiagonal, Elimination, Factor, FactoredElimination, checked
+from vibench.linalg.multigrid import MultigridFactor
 from vibench.provenance import distribution_version
 from vibench.text import shown
 
@@ -160,8 +161,6 @@ class _Multigrid(Implementation):
     module, is_iterative = "pyamg", True
 
     def _factor(self, matrix: SparseMatrix, name: str) -> Factor:
-        from vibench.linalg.multigrid import MultigridFactor  # noqa: PLC0415  an optional library
-
         return MultigridFactor(matrix, name)
 
     def eliminate(self, matrix: SparseMatrix, order: Indices, last: int, name: str) -> Elimination:

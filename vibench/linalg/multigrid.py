@@ -105,7 +105,7 @@ class NullSpaceSolver:
         self._unit, self._A, self._f, self._g = np.where(lengths > 0.0, lengths, 1.0), sp.csr_array(A), f, g
         self._B = sp.csr_array(sp.diags_array(1.0 / self._unit) @ B)
         self._u, self._base, self._set = np.zeros(len(f)), np.zeros(len(f), bool), np.zeros(0)
-        self._share = 1e-2
+        self._share, self._diagonal, self._largest = 1e-2, self._A.diagonal(), sp.linalg.norm(A, np.inf)
         self.noise: Array = np.zeros(len(g))
 
     @property
@@ -135,7 +135,7 @@ class NullSpaceSolver:
         def cycle(residual: Array) -> Array:
             r = np.zeros(len(load))
             r[is_free] = residual
-            z = r / diagonal
+            z = r / self._diagonal
             z[self._base] = self._cycle(r[self._base])
             return np.asarray(z[is_free])
 
@@ -143,10 +143,10 @@ class NullSpaceSolver:
             # The cycle of a set that differs in few rows costs less than another one.
             if 40 * np.count_nonzero(is_free != self._base) > len(active):
                 self._base, self._cycle = is_free, _cycle(A[is_free][:, is_free], "A on the free unknowns")
-            right, diagonal = reduced(load - A @ u), A.diagonal()
+            right = reduced(load - A @ u)
             size = float(np.sqrt(right @ cycle(right)))
             # Ten times the errors in B u: the norm of a row in A⁻¹ is at least its length over the root of that of A.
-            self.noise = np.asarray(10.0 * EXACT * size * self._unit / np.sqrt(sp.linalg.norm(A, np.inf)))
+            self.noise = np.asarray(10.0 * EXACT * size * self._unit / np.sqrt(self._largest))
             goal, start = self._share * size, self._u[is_free]
             u = u + lifted(
                 solution(lambda v: reduced(A @ lifted(v)), cycle, right, start, goal, "A on the free unknowns")

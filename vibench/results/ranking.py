@@ -148,9 +148,10 @@ def eligible(cells: pd.DataFrame) -> pd.Series:
 
 def contenders(cells: pd.DataFrame) -> pd.DataFrame:
     """The cells of one problem of which a verdict names the best: eligible ones, else those whose errors are large."""
-    timed, errors = cells["online_s"].notna(), errors_of_solution(cells)
+    timed, reasons = cells["online_s"].notna(), excluded(cells)
+    taking_part = timed & ~reasons.any(axis=1)
     # Errors too large for a ranking still tell how far away an answer is.
-    taking_part, inexact = eligible(cells) & timed, excluded(cells)["inexact"] & errors.notna() & timed
+    inexact = timed & reasons["inexact"] & errors_of_solution(cells).notna()
     return cells[taking_part if taking_part.any() else inexact]
 
 

@@ -374,7 +374,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "offline_a_s": real("s", "Offline seconds of a.", "offline against [s]", 18),
         "online_a_s": real("s", "Seconds of a query of a, in the rounds both share.", "online against [ms]", 18),
         "offline_b_s": real("s", "Offline seconds of b.", "offline [s]", 16),
-        "online_b_s": real("s", "Seconds of a query of b, in these blocks.", "online [ms]", 17),
+        "online_b_s": real("s", "Seconds of a query of b, in the rounds both share.", "online [ms]", 17),
         "gain": real("1", "Seconds of a query of a divided by those of b, paired within rounds.", "gain", 19),
         "gain_low": real("1", "Lower end of the 95 % interval of the gain."),
         "gain_high": real("1", "Upper end of this interval."),

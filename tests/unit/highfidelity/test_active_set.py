@@ -276,11 +276,10 @@ def test_coarser_meshes_save_iterations_and_change_no_solution(monkeypatch: pyte
 @NEEDS_PYAMG
 def test_by_multigrid_most_sets_are_solved_roughly_and_no_matrix_is_factorised(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(obstacle, "NESTED", 1500)
-    default, made = Obstacle(1600, ceiling=0.012), {"resolution": 1600, "ceiling": 0.012, "factorisation": "multigrid"}
-    problem = create("problem", "obstacle", made)
+    default, solve = Obstacle(1600, ceiling=0.012), NullSpaceSolver.__call__
+    problem = create("problem", "obstacle", {"resolution": 1600, "ceiling": 0.012, "factorisation": "multigrid"})
     problem.V.__dict__["_factor"] = None
     (solver, exact), shares, V = map(HighFidelitySolver, (problem, default)), list[float](), default.V
-    solve = NullSpaceSolver.__call__
     monkeypatch.setattr(NullSpaceSolver, "__call__", lambda self, *a: (solve(self, *a), shares.append(self._share))[0])
     for mu in problem.parameters.sample(2, 0):
         found, expected = solver.solve(mu), exact.solve(mu)
@@ -313,5 +312,6 @@ def test_a_start_of_the_wrong_kind_is_named() -> None:
     problem = Obstacle(400)
     for start in (np.zeros(3, bool), np.zeros(problem.W.dim)):  # too short, not of booleans
         problem.start = lambda mu, nearest, start=start: start  # type: ignore[method-assign]
-        with pytest.raises(NumericalError, match=rf"start returns .* \({problem.W.dim},\), a NestedStart, or None"):
+        expected = rf"start returns .*; expected truth values \({problem.W.dim},\), a NestedStart, or None"
+        with pytest.raises(NumericalError, match=expected):
             HighFidelitySolver(problem).solve(MU)

@@ -484,7 +484,7 @@ def test_outside_the_box_only_exact_models_have_bounds() -> None:
             here.setattr(Implementation, "is_iterative", iterative)
             bases = [prepared(one, tolerance=1e-3 + iterative)[2].base for one in ("constant", "affine")]
         assert {base.guarantee for base in bases} == {worth}
-    assert bases[0].spectral is None
+        assert bases[0].spectral is None
     mu = np.array([2.3, 0.4])
     for stiffness, has_bound in (("affine", True), ("interpolated", False)):
         given = prepared(stiffness, constraint="scaled")
