@@ -48,7 +48,7 @@ def export_model(
     tolerance
         Largest relative error of the polynomials that take the place of A, f, B and g.
     evaluations
-        Points of the largest grid of parameters at which these are evaluated.
+        Points of the largest grid of parameters at which these are evaluated; four times as many of coefficients.
     bases
         Whether the file has the primal basis and the generators, from which u and λ are reconstructed.
     c

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import prod
 from types import MappingProxyType
@@ -59,10 +59,10 @@ def interpolate_on_box(
     """Tensor-product Chebyshev interpolation of arrays on a box (Trefethen 2013, chapters 3 and 8).
 
     Degrees differ by direction: along random lines, the arrays are interpolated with more and more points until the
-    coefficients have decayed to a tenth of the tolerance, relative to the largest array (`_degree`). One grid has these
-    degrees, or larger ones if its measured error is above the tolerance. Every array loses the coefficients it does not
-    need. If all have the tolerance, those without given terms are factorised into θ and terms by a singular value
-    decomposition.
+    coefficients have decayed to a tenth of the tolerance, relative to the largest array. One grid has these degrees, or
+    larger ones if its measured error is above the tolerance. An array that misses the tolerance has a grid of its own
+    if it varies less than others in some direction. Every array loses the coefficients it does not need. If all of a
+    grid have the tolerance, those without given terms are factorised into θ and terms by singular values.
 
     `evaluate` gives the arrays at a parameter of the box from `lower` to `upper` (d,), and `budget` is the largest
     number of points of a grid. The relative `tolerance` may be missed: functions that are not smooth take too many
@@ -90,27 +90,45 @@ def interpolate_on_box(
     along = _Sampled(evaluate, lower, upper, units)
     # A function that needs more points than that along a line has a grid beyond the budget, or nearly.
     limit = max(9, round(4 * budget ** (1.0 / len(lower)))) if len(lower) > 1 else budget
-    counts = [max(along.degree(k, at, 0.1 * tolerance, limit) for at in anchors) + 1 for k in range(len(lower))]
+    lines = [[along.counts(k, at, 0.1 * tolerance, limit) for at in anchors] for k in range(len(lower))]
 
     def measured(name: str, polynomial: AffinePolynomial) -> AffinePolynomial:
         error = float(np.linalg.norm(polynomial.evaluate(unit) - values[name], axis=-1).max()) / scale[name]
         return replace(polynomial, error=error, scale=scale[name])
 
+    def counts_of(names: Collection[str]) -> list[int]:
+        return [max(found[name] for found in line for name in names) for line in lines]
+
+    together = counts_of(values)
+    polynomials = _on_grids(along, values, together, tolerance, budget, terms, measured)
+    for names in dict.fromkeys(tuple(alike) if name in alike else (name,) for name in values):
+        alone = counts_of(names)
+        if alone != together and max(polynomials[name].error for name in names) > tolerance:
+            polynomials |= _on_grids(along, names, alone, tolerance, budget, terms, measured)
+    return polynomials
+
+
+def _on_grids(
+    along: _Sampled, names: Collection[str], counts: Sequence[int], tolerance: float, budget: int,
+    terms: Mapping[str, Array], measured: Callable[[str, AffinePolynomial], AffinePolynomial],
+) -> dict[str, AffinePolynomial]:  # fmt: skip
+    """Polynomials of some of the arrays on the first grid on which all have the tolerance, or on the last one."""
     # three grids, each with a quarter more points per direction than the last: the lines may have missed some
     for _ in range(3):
         counts = _within(counts, budget)
-        kept = {name: _needed(c, 0.1 * tolerance) for name, c in along.coefficients(counts).items()}
+        kept = {name: _needed(c, 0.1 * tolerance) for name, c in along.coefficients(counts, names).items()}
         polynomials = {}
-        for name, given in terms.items():
+        for name in kept.keys() & terms.keys():
             indices, c = kept[name]
             # Products of Chebyshev polynomials are at most 1: what is left out sums up to a tenth of the tolerance.
-            theta = np.where(np.abs(c) > 0.1 * tolerance / c.size, c, 0.0) * units[name]
-            polynomials[name] = AffinePolynomial(indices, theta, given, np.inf, 1.0)
+            theta = np.where(np.abs(c) > 0.1 * tolerance / c.size, c, 0.0) * along.units[name]
+            polynomials[name] = AffinePolynomial(indices, theta, terms[name], np.inf, 1.0)
         for name in kept.keys() - terms.keys():
             indices, c = kept[name]
             count, size = c.shape
             # the coefficients themselves are the terms, or the entries of the array, whichever are fewer
-            theta, own = (c, units[name] * np.eye(size)) if size < count else (np.eye(count), units[name] * c)
+            whole = along.units[name]
+            theta, own = (c, whole * np.eye(size)) if size < count else (np.eye(count), whole * c)
             polynomials[name] = AffinePolynomial(indices, theta, own, np.inf, 1.0)
         polynomials = {name: measured(name, polynomials[name]) for name in kept}
         if max(p.error for p in polynomials.values()) <= tolerance:
@@ -127,15 +145,16 @@ class _Sampled:
     """Arrays over their units, sampled on lines and grids of Chebyshev points."""
 
     def __init__(self, evaluate: Evaluate, lower: Array, upper: Array, units: Mapping[str, Any]) -> None:
-        self._evaluate, self._lower, self._upper, self._units = evaluate, lower, upper, units
+        self._evaluate, self._lower, self._upper, self.units = evaluate, lower, upper, units
 
-    def _at(self, unit: Array) -> dict[str, Array]:
-        """The arrays at points (P×d) of the unit box, (P×size) each."""
-        stacked = _stacked([self._evaluate(self._lower + at * (self._upper - self._lower)) for at in unit])
-        return {name: values / self._units[name] for name, values in stacked.items()}
+    def _at(self, unit: Array, names: Collection[str]) -> dict[str, Array]:
+        """Some of the arrays at points (P×d) of the unit box, (P×size) each."""
+        found = [self._evaluate(self._lower + at * (self._upper - self._lower)) for at in unit]
+        stacked = _stacked([{name: arrays[name] for name in names} for arrays in found])
+        return {name: values / self.units[name] for name, values in stacked.items()}
 
-    def degree(self, direction: int, anchor: Array, tolerance: float, limit: int) -> int:
-        """The degree in one direction from which on coefficients on the line through a point sum up to the tolerance.
+    def counts(self, direction: int, anchor: Array, tolerance: float, limit: int) -> dict[str, int]:
+        """Numbers of coefficients on the line through a point, without last ones that sum up to the tolerance.
 
         The number of points is doubled until the last third of the coefficients is not needed.
         """
@@ -143,17 +162,19 @@ class _Sampled:
         while True:
             line = np.tile(anchor, (count, 1))
             line[:, direction] = _chebyshev_points(count)
-            norms = [np.linalg.norm(_transformed(values, 0), axis=1) for values in self._at(line).values()]
-            tails = np.max([np.cumsum(sizes[::-1])[::-1] for sizes in norms], axis=0)
-            needed = int(np.count_nonzero(tails > tolerance))
-            if 3 * needed <= 2 * count or count >= limit:
-                return max(needed, 1) - 1
+            needed = dict[str, int]()
+            for name, values in self._at(line, self.units).items():
+                sizes = np.linalg.norm(_transformed(values, 0), axis=1)
+                needed[name] = max(int(np.count_nonzero(np.cumsum(sizes[::-1]) > tolerance)), 1)
+            if 3 * max(needed.values()) <= 2 * count or count >= limit:
+                return needed
             count = min(2 * count, limit)
 
-    def coefficients(self, counts: Sequence[int]) -> dict[str, Array]:
-        """Coefficients (n₁×…×n_d×size) of the interpolants on a grid with this many points per direction."""
+    def coefficients(self, counts: Sequence[int], names: Collection[str]) -> dict[str, Array]:
+        """Coefficients (n₁×…×n_d×size) of some interpolants on a grid with this many points per direction."""
         grid = np.stack(np.meshgrid(*map(_chebyshev_points, counts), indexing="ij"), axis=-1)
-        coefficients = {name: v.reshape(*counts, -1) for name, v in self._at(grid.reshape(-1, len(counts))).items()}
+        found = self._at(grid.reshape(-1, len(counts)), names)
+        coefficients = {name: values.reshape(*counts, -1) for name, values in found.items()}
         for axis in range(len(counts)):
             coefficients = {name: _transformed(values, axis) for name, values in coefficients.items()}
         return coefficients

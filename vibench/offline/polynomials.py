@@ -71,7 +71,9 @@ def member_polynomials(
             found |= {name: theta[member] for name, member in theta_of.items()}
             return found | {name: np.ones(1) for name in constant}
 
-        grid, alike = (box.lower, box.upper, tolerance, evaluations), ["A", *rotated] if rotated else []
+        # Coefficients cost little beside a member.
+        budget = evaluations if any(name not in terms for name in chosen) else 4 * evaluations
+        grid, alike = (box.lower, box.upper, tolerance, budget), ["A", *rotated] if rotated else []
         polynomials = interpolate_on_box(evaluate, *grid, terms=terms, alike=alike)
     except NumericalError as error:
         raise RequestError(f"the model cannot be evaluated in the whole parameter box: {error}") from None
