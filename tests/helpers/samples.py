@@ -230,7 +230,11 @@ def mixed_cell(
     return program_queries(enrichment, interpolation, validation, solver, accuracy, bounds=bounds)
 
 
-def pga_reduction(problem: vibench.Problem, generators: float, **more: Any) -> vibench.Reduction:
-    """A reduction with modes of 1e-4, cones by mCPG up to a tolerance, and offline PGA."""
-    strategies = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
-    return vibench.Reduction(problem, *strategies, vibench.Stop(1e-4), vibench.Stop(generators), tolerance=0.5, **more)
+def pga_reduction(
+    problem: vibench.Problem, generators: float | vibench.Stop, modes: float | vibench.Stop = 1e-4, *,
+    primal: str = "offline-pga", tolerance: float | None = 0.5, **more: Any,
+) -> vibench.Reduction:  # fmt: skip
+    """A reduction with modes and cones by mCPG up to tolerances, and offline PGA or another primal strategy."""
+    strategies = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", primal)
+    stops = (each if isinstance(each, vibench.Stop) else vibench.Stop(each) for each in (modes, generators))
+    return vibench.Reduction(problem, *strategies, *stops, tolerance=tolerance, **more)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from samples import pga_reduction
 
 import vibench
 from vibench_problems.elliptic_contact import elliptic_contact
@@ -51,9 +52,7 @@ def export_from_freefem(folder: Path, model: str, size: str) -> None:
 
 
 def certified_model(pack: vibench.Problem) -> vibench.Model:
-    dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
-    given = vibench.Stop(1e-2), vibench.Stop(1e-2)
-    return vibench.Reduction(pack, dual, primal, *given, tolerance=0.5, assembly="reduced", bounds=True).model
+    return pga_reduction(pack, 1e-2, 1e-2, assembly="reduced", bounds=True).model
 
 
 def run(example: Path, monkeypatch: pytest.MonkeyPatch) -> vibench.Run:

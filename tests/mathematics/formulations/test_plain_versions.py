@@ -3,8 +3,9 @@
 import numpy as np
 import plain_formulations as plain
 import pytest
+from samples import pga_reduction
 
-from vibench import FormulationAnswer, HighFidelitySolver, QuerySettings, Reduction, Stop, create
+from vibench import FormulationAnswer, HighFidelitySolver, QuerySettings, Reduction, create
 from vibench.offline.models import CellSolver
 from vibench.signatures import _Signature
 
@@ -16,8 +17,7 @@ SOLVE = CellSolver("piqp", ACCURACY)
 def discs() -> Reduction:
     pytest.importorskip("sklearn")  # of both versions of `regression`
     problem = create("problem", "hertz", {"resolution": 300})
-    pair = create("dual strategy", "mcpg"), create("primal strategy", "offline-pga")
-    return Reduction(problem, *pair, Stop(1e-3), Stop(1e-2), 0.5, assembly="reduced", accuracy=ACCURACY)
+    return pga_reduction(problem, 1e-2, 1e-3, assembly="reduced", accuracy=ACCURACY)
 
 
 @pytest.mark.parametrize(("name", "options", "plainly", "tolerance"), [

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from samples import pga_reduction
 
 import vibench
 from vibench.calibration.data import Sensors
@@ -41,9 +42,7 @@ def test_errors_are_at_most_186_roots_of_the_natural_residual() -> None:
 
 
 def test_the_distance_needs_no_constraint_where_it_is_a_multiple_of_one_matrix() -> None:
-    strategies = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
-    stops = vibench.Stop(tolerance=1e-2), vibench.Stop(tolerance=1e-1)
-    phase = vibench.Reduction(Radial("coarse"), *strategies, *stops, 0.5, assembly="reduced", bounds=True)
+    phase = pga_reduction(Radial("coarse"), 1e-1, 1e-2, assembly="reduced", bounds=True)
     by_multiple, by_constraint = BoundedSensors(phase.model, NAMES), BoundedSensors(phase.model, NAMES)
     by_constraint._is_scaled = False
     for mu in phase.model.parameters.sample(3, 1):

@@ -12,17 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from samples import pga_reduction
 
 import vibench
+from vibench.calibration import decisions
 from vibench.calibration.data import Data, Prior, Sensors
-from vibench.calibration.decisions import (
-    BoundedSensors,
-    CompiledSensors,
-    Decisions,
-    Prediction,
-    RefutedError,
-    quickest_sensors,
-)
+from vibench.calibration.decisions import BoundedSensors, Decisions, Prediction, RefutedError
 from vibench.calibration.metropolis import Metropolis, summary
 from vibench.calibration.ranked import minimise
 from vibench.errors import RequestError
@@ -40,9 +35,7 @@ STEPS = 120
 
 @cache
 def radial() -> vibench.Model:
-    strategies = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
-    stops = vibench.Stop(tolerance=1e-3), vibench.Stop(tolerance=1e-2)
-    return vibench.Reduction(Radial("coarse"), *strategies, *stops, 0.5, assembly="reduced", bounds=True).model
+    return pga_reduction(Radial("coarse"), 1e-2, 1e-3, assembly="reduced", bounds=True).model
 
 
 @cache
@@ -58,8 +51,8 @@ def data(noise: float) -> Data:
 
 
 def chain(noise: float, steps: int, *models: Callable[[np.ndarray], Prediction], audit: float = 0.01) -> Metropolis:
-    decisions = Decisions(radial().problem, data(noise), models, audit, 0)
-    made = Metropolis(decisions, Prior.of(radial().parameters), steps // 5, 3)
+    decided = Decisions(radial().problem, data(noise), models, audit, 0)
+    made = Metropolis(decided, Prior.of(radial().parameters), steps // 5, 3)
     while made.steps < steps:
         made.step()
     return made
@@ -245,10 +238,10 @@ def test_queries_begin_with_the_last_solution_of_the_same_size(monkeypatch: pyte
 
 
 @cache
-def compiled() -> CompiledSensors:
+def compiled() -> decisions.CompiledSensors:
     if shutil.which("cc") is None:
         pytest.skip("needs a C compiler")
-    return CompiledSensors(bounded())
+    return decisions.CompiledSensors(bounded())
 
 
 def test_the_c_program_has_the_bounds_of_vibench() -> None:
@@ -269,11 +262,11 @@ def test_the_c_program_has_the_bounds_of_vibench() -> None:
 
 def test_without_a_compiler_python_answers_and_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", "no-such-compiler")
-    predict, by = quickest_sensors(radial(), NAMES)
+    predict, by = decisions.quickest_sensors(radial(), NAMES)
     assert isinstance(predict, BoundedSensors)
     assert by == "Python: the environment variable CC names the C compiler 'no-such-compiler', which is not found"
     with pytest.raises(RequestError, match="no linear output of the problem is called 'deflection'"):
-        quickest_sensors(radial(), ("deflection",))
+        decisions.quickest_sensors(radial(), ("deflection",))
 
 
 def test_what_has_no_bound_is_refused() -> None:
@@ -315,10 +308,10 @@ def test_earlier_answers_lead_to_the_same_chain_without_questions() -> None:
 
 
 def test_outside_the_box_nothing_is_claimed() -> None:
-    decisions = Decisions(radial().problem, data(0.01), [bounded()], 0.01, 0)
+    decided = Decisions(radial().problem, data(0.01), [bounded()], 0.01, 0)
     outside = radial().parameters.upper + 0.001
-    assert (decisions.interval(outside).lower, decisions.interval(outside).upper) == (0.0, np.inf)
-    assert decisions.interval(TRUTH).upper < np.inf
+    assert (decided.interval(outside).lower, decided.interval(outside).upper) == (0.0, np.inf)
+    assert decided.interval(TRUTH).upper < np.inf
 
 
 def test_the_posterior_is_that_of_the_closed_form() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import scipy.sparse.linalg
-from samples import small_study, with_ways
+from samples import pga_reduction, small_study, with_ways
 
 import vibench
 from vibench import AffineProblem, Output, export_model
@@ -196,9 +196,7 @@ def assert_certified_alike(
 
 def test_expressions_are_exact_in_c_and_bounds_are_certified(tmp_path: Path) -> None:
     """The same numbers as those of vibench to round-off, though no polynomial of the file reaches that."""
-    dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
-    strategies = dual, primal, vibench.Stop(tolerance=1e-1), vibench.Stop(tolerance=1e-1)
-    model = vibench.Reduction(Expressed(), *strategies, tolerance=0.3, assembly="reduced", bounds=True).model
+    model = pga_reduction(Expressed(), 1e-1, 1e-1, tolerance=0.3, assembly="reduced", bounds=True).model
     assert model.certificate.base.guarantee is Guarantee.CERTIFIED
     certified, whole, _ = certify(model, tmp_path / "model.npz", tolerance=1e-2)
     assert set(whole.exact) == {*"AfBg", "theta_A", "theta_f", "theta_B", "theta_g"}
@@ -220,9 +218,8 @@ def test_a_c_source_has_its_bounds(problem: str, small_run: vibench.Run, tmp_pat
     )
     monkeypatch.setattr(type(model.problem), "outputs", outputs)
     certified, whole, found = certify(model, tmp_path / "model.npz", tolerance=2e-13)
-    assert_certified_alike(
-        model, certified, (1e-9, 1e-9, 2e-9, 2e-9), 1e-9
-    )  # the last ones have the error of sizes, too
+    # The last two bounds have the error of sizes, too.
+    assert_certified_alike(model, certified, (1e-9, 1e-9, 2e-9, 2e-9), 1e-9)
     assert certified(model.parameters.upper, corrected=True)[0] == 0
     code, u, lam, bounds = certified(model.parameters.upper * 1.001, corrected=True)
     assert code == 4
@@ -317,11 +314,9 @@ PRIMAL = {"offline-pga": 0.5, "online-supremizers": None}
 
 
 def reduced_from(problem: vibench.Problem, primal: str, **others: Any) -> vibench.Model:
-    strategies = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", primal)
-    stops = vibench.Stop(tolerance=1e-2), vibench.Stop(tolerance=1e-1)
     few = vibench.create("sampling strategy", "random", {"size": 12, "seed": 1})
     given = {"tolerance": PRIMAL[primal], "training": few, "assembly": "reduced", "bounds": True} | others
-    return vibench.Reduction(problem, *strategies, *stops, **given).model
+    return pga_reduction(problem, 1e-1, 1e-2, primal=primal, **given).model
 
 
 @pytest.mark.parametrize("primal", PRIMAL)
@@ -367,9 +362,7 @@ class Turning(Expressed):
 
 
 def test_spaces_that_change_with_the_parameter_have_c_programs(tmp_path: Path) -> None:
-    dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "online-supremizers")
-    stops = vibench.Stop(tolerance=1e-1), vibench.Stop(tolerance=1e-1)
-    model = vibench.Reduction(Turning(), dual, primal, *stops, assembly="reduced").model
+    model = pga_reduction(Turning(), 1e-1, 1e-1, primal="online-supremizers", tolerance=None, assembly="reduced").model
     assert model.reduced.space is not None
     arrays = export_model(model, tmp_path / "model.npz", c=True, tolerance=1e-2).arrays
     solve = compiled(tmp_path / "model.c", arrays["basis"].shape[1], arrays["generators"].shape[1])

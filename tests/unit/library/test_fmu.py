@@ -1,11 +1,13 @@
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from samples import pga_reduction
 
 import vibench
 from vibench import AffineProblem, Output, RequestError, export_model
@@ -43,15 +45,8 @@ class String(AffineProblem):
 @pytest.fixture(scope="module")
 def model_of() -> ModelOf:
     """The model of the string with or without bounds, coarse enough to have errors."""
-    dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
-    made = {
-        bounds: vibench.Reduction(
-            String(), dual, primal, vibench.Stop(size=1), vibench.Stop(size=2),
-            tolerance=0.3, assembly="reduced", bounds=bounds,
-        ).model
-        for bounds in (False, True)
-    }  # fmt: skip
-    return made.__getitem__
+    stops, given = (vibench.Stop(size=2), vibench.Stop(size=1)), {"tolerance": 0.3, "assembly": "reduced"}
+    return cache(lambda bounds: pga_reduction(String(), *stops, bounds=bounds, **given).model)
 
 
 def simulated(file: Path, mu: np.ndarray) -> dict[str, float]:

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from samples import pga_reduction
 
 import vibench
-from vibench import Reduction, RequestError, Stop, create, export_vtu
+from vibench import RequestError, Stop, create, export_vtu
 from vibench.offline.reduction import high_fidelity_sweep
 
 meshio = pytest.importorskip("meshio")
@@ -23,8 +24,7 @@ def model_of(name: str) -> vibench.Model:
     problem = create("problem", name, SMALL[name])
     box = problem.parameters
     training = box.lower + np.array([[0.1], [0.5], [0.9]]) * box.widths
-    strategies = create("dual strategy", "mcpg"), create("primal strategy", "offline-pga")
-    reduction = Reduction(problem, *strategies, Stop(size=3), Stop(size=3), tolerance=0.5)
+    reduction = pga_reduction(problem, Stop(size=3), Stop(size=3))
     return reduction.given(snapshots=high_fidelity_sweep(problem, training)).model
 
 

@@ -3,7 +3,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from samples import SMALL, with_ways
+from samples import SMALL, pga_reduction, with_ways
 
 import vibench
 from vibench import UnsupportedError
@@ -14,9 +14,7 @@ PROBLEM = {"name": "radial-obstacle", "options": {"resolution": 200}}
 @pytest.fixture(scope="module")
 def reduce() -> partial[vibench.Reduction]:
     problem = vibench.create("problem", PROBLEM["name"], PROBLEM["options"])
-    dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
-    stops = {"modes": vibench.Stop(tolerance=1e-2), "generators": vibench.Stop(tolerance=1e-1)}
-    return partial(vibench.Reduction, problem, dual, primal=primal, **stops, tolerance=0.5)
+    return partial(pga_reduction, problem, 1e-1, 1e-2)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +31,7 @@ def test_a_reduction_answers_as_the_run_of_the_same_study(
     row = rows.loc[(PROBLEM["name"], primal, assembly)]
     certified, theirs = assembly == "certified", small_run.model(row["cell"])
     reduction = reduce(
-        primal=vibench.create("primal strategy", primal), tolerance=0.5 if primal == "offline-pga" else None,
+        primal=primal, tolerance=0.5 if primal == "offline-pga" else None,
         assembly="reduced" if certified else "full", bounds=certified,
         interpolation=SMALL.interpolation, accuracy=SMALL.accuracy[0], solver=theirs.solver,
     ).given(snapshots=snapshots)  # fmt: skip
@@ -123,9 +121,8 @@ def test_what_is_asked_for_wrongly_is_one_line(reduce: partial[vibench.Reduction
 def test_certificates_hold_where_supremizers_use_few_of_the_coordinates_of_their_space() -> None:
     """Those of Hertz contact, whose loads reach some contact unknowns only."""
     problem = vibench.create("problem", "hertz", {"resolution": 300})
-    cone, supremizers = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "online-supremizers")
-    stops = vibench.Stop(tolerance=1e-2), vibench.Stop(tolerance=1e-2)
-    model = vibench.Reduction(problem, cone, supremizers, *stops, assembly="reduced", bounds=True).model
+    given = {"primal": "online-supremizers", "tolerance": None, "assembly": "reduced", "bounds": True}
+    model = pga_reduction(problem, 1e-2, 1e-2, **given).model
     for mu in problem.parameters.sample(2, 5):
         found, exact = model.solve(mu), model.high_fidelity(mu)
         e, A = exact.u - found.u, problem.assemble(mu).A

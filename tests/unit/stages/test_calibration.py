@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from samples import pga_reduction
 
 import vibench
 from vibench.calibration.data import Prior, Sensors, synthetic
@@ -49,8 +50,7 @@ def test_every_ok_cell_has_chains_or_a_reason_also_where_the_task_is_added_later
 
 def test_a_model_without_bounds_walks_the_high_fidelity_chain_and_its_wrong_decisions_are_counted() -> None:
     problem = Coarse()
-    strategies = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
-    model = vibench.Reduction(problem, *strategies, vibench.Stop(size=1), vibench.Stop(size=2), 0.5).model
+    model = pga_reduction(problem, vibench.Stop(size=2), vibench.Stop(size=1)).model
     names = tuple(output.name for output in problem.outputs)
     chains, exact = [], Sensors(problem)(np.array([0.17, 0.1]))
     for models in ((_unbounded(model, names),), ()):

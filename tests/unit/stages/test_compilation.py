@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from samples import small_study
+from samples import pga_reduction, small_study
 
 import vibench
 from vibench import MEMBERS, Status, UnsupportedError, VariationalInequality
@@ -138,12 +138,9 @@ def test_programs_answer_say_what_they_cannot_and_are_repeated_near_by() -> None
 
 
 def test_constraints_in_the_code_of_a_problem_are_in_the_program() -> None:
-    dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
     few = vibench.create("sampling strategy", "random", {"size": 8, "seed": 1})
-    stops = vibench.Stop(tolerance=1e-2), vibench.Stop(tolerance=1e-1)
-    given = {"tolerance": 0.5, "training": few, "assembly": "reduced"}
     form = vibench.create("formulation", "compiled")
-    model = vibench.Reduction(Hertz(300), dual, primal, *stops, formulation=form, **given).model
+    model = pga_reduction(Hertz(300), 1e-1, 1e-2, formulation=form, training=few, assembly="reduced").model
     assert set(model.built["polynomials"].members) == {"A", "f"}
     for mu in model.parameters.sample(3, seed=1):
         found = model.solve(mu)
