@@ -6,6 +6,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench import Array, InnerProduct, ParameterBox, Problem, VariationalInequality
+from vibench.highfidelity.kkt_systems import CondensedStiffness
+from vibench.model.errors import EnergyNorm
 
 
 def spd(n: int, rng: np.random.Generator, spread: float = 10.0) -> Array:
@@ -84,3 +86,7 @@ def exact(vi: VariationalInequality) -> tuple[np.ndarray, np.ndarray]:
         if np.all(lam >= -1e-10 * size) and np.all(rows @ y - g <= 1e-10 * size):
             return np.linalg.solve(half.T, y), lam / lengths
     raise AssertionError("no active set")
+
+
+def energy(vi: VariationalInequality) -> EnergyNorm:
+    return EnergyNorm(vi.A, CondensedStiffness(vi.A))

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import pytest
 from samples import write_study
 from typer.testing import CliRunner
 
+from vibench import RequestError
 from vibench.cli.main import app
 from vibench.results.schema import KEYS, STORED, TABLES
 from vibench.results.sqlite import FILE, Digests, text_reader
@@ -212,3 +214,13 @@ def refused(outcome: tuple[int, str, str], *words: str) -> str:
     assert "Traceback" not in err
     assert [word for word in words if word not in err] == [], err
     return err
+
+
+def refusal(action: Callable[..., object], *arguments: object, **named: object) -> str:
+    """The one line by which a call refuses a request; fails unless it does."""
+    with pytest.raises(RequestError) as caught:
+        action(*arguments, **named)
+    line = str(caught.value)
+    assert line.strip()
+    assert line.splitlines() == [line]
+    return line

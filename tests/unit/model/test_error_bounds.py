@@ -9,7 +9,7 @@ import scipy.sparse as sp
 from decimals import ExactProgram
 from hypothesis import given
 from hypothesis import strategies as st
-from numerics import exact, space, spd
+from numerics import energy, exact, space, spd
 
 from vibench import InnerProduct, NumericalError, VariationalInequality
 from vibench.highfidelity.active_set import ACCURACY, HighFidelitySolver, solve_unverified
@@ -34,10 +34,6 @@ ROUND_OFF = 1e-7
 
 EXACT = 1e-12
 """Round-off in the solution of a small inequality, relative."""
-
-
-def energy(vi: VariationalInequality) -> EnergyNorm:
-    return EnergyNorm(vi.A, CondensedStiffness(vi.A))
 
 
 def stability(vi: VariationalInequality) -> Stability:

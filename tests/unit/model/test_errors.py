@@ -6,13 +6,12 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from numerics import Varying, space
+from numerics import Varying, energy, space
 
 from vibench import Problem, VariationalInequality
 from vibench.highfidelity import active_set
-from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.model.error_bounds import error_bounds
-from vibench.model.errors import UNMEASURABLE, EnergyNorm, ReferenceSolutions, errors
+from vibench.model.errors import UNMEASURABLE, ReferenceSolutions, errors
 from vibench.model.hsw_bounds import hsw_bounds
 from vibench.reduction import constraint_classes
 from vibench.stability import cone_basis, inf_sup_full, inf_sup_on
@@ -95,10 +94,6 @@ def test_nothing_is_certified_without_stability_or_outside_the_cone() -> None:
     found = bound(PROBLEM, vi, unstable, exact.u, exact.lam)
     assert (found.u, found.lam) == (np.inf, np.inf)
     assert bound(PROBLEM, vi, known, exact.u, exact.lam - 1e-3) is None
-
-
-def energy(vi: VariationalInequality) -> EnergyNorm:
-    return EnergyNorm(vi.A, CondensedStiffness(vi.A))
 
 
 def test_errors_are_those_defined_and_only_zero_is_zero() -> None:

@@ -2,7 +2,6 @@ import datetime
 import importlib.metadata
 import sys
 import types
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import Annotated, Any, Literal
 import fake_plugins
 import pytest
 from annotated_types import Ge, Gt, Le, Lt, MinLen
-from running import Register
+from running import Register, refusal
 from samples import FAKES, install
 
-from vibench import DualStrategy, RequestError, read_study
+from vibench import DualStrategy, read_study
 from vibench.plugins import registry
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
@@ -87,14 +86,6 @@ GROUP = PluginKind.DUAL.entry_points
 def _own(register: Register) -> None:
     members = ("Choosy", "Plain", "Heir", "Record", "Open")
     register(*((GROUP, member.lower(), f"{HERE}:{member}") for member in members))
-
-
-def refusal(action: Callable[..., Any], *arguments: Any) -> str:
-    with pytest.raises(RequestError) as caught:
-        action(*arguments)
-    line = str(caught.value)
-    assert "\n" not in line
-    return line
 
 
 @pytest.mark.parametrize("kind", [PluginKind.PROBLEM, PluginKind.DUAL, PluginKind.PRIMAL])

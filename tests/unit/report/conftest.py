@@ -32,6 +32,11 @@ def reported(quick_run: Path, shared: Shared) -> Path:
     return shared("reported", make)
 
 
+@pytest.fixture(scope="session")
+def made(reported: Path) -> Path:
+    return reported / "report.html"
+
+
 @pytest.fixture(scope="module")
 def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("downloads")

@@ -23,11 +23,6 @@ from vibench.text import brief
 FEW = "DELETE FROM cells WHERE problem = 'hertz' OR dual = 'cpg'"
 
 
-@pytest.fixture(scope="module")
-def made(reported: Path) -> Path:
-    return reported / "report.html"
-
-
 def test_it_needs_nothing_but_itself_and_says_what_headings_and_pictures_mean(made: Path) -> None:
     page = made.read_text(encoding="utf-8")
     links = Links(page)

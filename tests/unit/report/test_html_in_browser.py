@@ -62,11 +62,6 @@ return texts;
 
 
 @pytest.fixture(scope="module")
-def made(reported: Path) -> Path:
-    return reported / "report.html"
-
-
-@pytest.fixture(scope="module")
 def cells(reported: Path) -> pd.DataFrame:
     return in_order(read_table(reported / FILE, "cells"))
 

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from running import refusal
 from samples import REMOVE, STUDY, changed, toml, write_study
 
 from vibench import RequestError, Study
@@ -14,15 +15,6 @@ from vibench.study.matrix import expand, find_study, read_study
 
 JARGON = ("list[", "dict[", "literal[", "constrained", "instance of")
 """Words of the validation library that mean nothing to the author of a study file."""
-
-
-def refusal(request: str, overrides: Mapping[str, Any] | None = None) -> str:
-    with pytest.raises(RequestError) as caught:
-        read_study(request, overrides)
-    line = str(caught.value)
-    assert line.strip()
-    assert "\n" not in line
-    return line
 
 
 def test_correct_studies_are_read_as_written_by_path_or_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,14 +126,14 @@ def test_what_is_wrong_is_said_in_one_line_without_the_key_itself(tmp_path: Path
     cases.append((changed(STUDY, "see\nd", to=1), ("did you mean 'seed'",)))
     for content, words in cases:
         path = write_study(tmp_path, content)
-        line = refusal(path)
+        line = refusal(read_study, path)
         assert line.startswith(f"{path}: ")
         message = line.removeprefix(path)
         assert [word for word in words if word.lower() not in message.lower()] == [], line
         assert [word for word in JARGON if word in message] == [], line
     places = (((), "pod"), ((), "resolution"), (("limits",), "seed"), (TABLE, "name"))
     for where, key in places:
-        line = refusal(write_study(tmp_path, changed(changed(STUDY, "limits", to={}), *where, key, to=1)))
+        line = refusal(read_study, write_study(tmp_path, changed(changed(STUDY, "limits", to={}), *where, key, to=1)))
         assert f"'{key}'" in line
         assert f"did you mean '{key}'" not in line
 
@@ -155,7 +147,7 @@ def test_the_smallest_study_names_its_problem(tmp_path: Path) -> None:
     for key in ("validation", "solvers", "dual", "primal", "tolerances", "assembly"):
         assert getattr(study, key) == getattr(usual, key)
     path.write_text('problem = ["obstacle"]\ndual = ["cpg"]\n')
-    assert "tolerances" in refusal(str(path))
+    assert "tolerances" in refusal(read_study, str(path))
 
 
 def test_what_a_study_does_not_name_serves_the_dual_sets_of_its_problems(tmp_path: Path) -> None:
@@ -179,24 +171,24 @@ def test_what_a_study_does_not_name_serves_the_dual_sets_of_its_problems(tmp_pat
 
 def test_what_is_no_file_of_a_study_or_invalid_toml_is_refused(tmp_path: Path) -> None:
     missing = str(tmp_path / "nowhere.toml")
-    assert f"'{missing}' does not exist" in refusal(missing)
+    assert f"'{missing}' does not exist" in refusal(read_study, missing)
     for name in ("folder", "folder.toml"):
         (tmp_path / name).mkdir()
-        assert f"{name}' is not a file" in refusal(str(tmp_path / name))
-    assert "did you mean 'quick'" in refusal("qiuck")
-    assert "study" in refusal("a" * 300)  # too long for the name of a file
+        assert f"{name}' is not a file" in refusal(read_study, str(tmp_path / name))
+    assert "did you mean 'quick'" in refusal(read_study, "qiuck")
+    assert "study" in refusal(read_study, "a" * 300)  # too long for the name of a file
     for content in (b"\x00\x01\xff\xfe", b"\x89PNG\r\n\x1a\n", b"name = 'gr\xf6sse'"):
         path = tmp_path / "study.toml"
         path.write_bytes(content)
-        assert refusal(str(path)).startswith(f"{path}: ")
+        assert refusal(read_study, str(path)).startswith(f"{path}: ")
     path = tmp_path / "study.toml"
     for text in INVALID.values():
         path.write_text(text)
-        line = refusal(str(path))
+        line = refusal(read_study, str(path))
         assert line.startswith(f"{path}: ")
         assert "TOML" in line
     path.write_text('name = "a"\nseed = = 3\n')
-    assert "line 2" in refusal(str(path))
+    assert "line 2" in refusal(read_study, str(path))
 
 
 INVALID = {
@@ -254,7 +246,7 @@ def test_wrong_overrides_are_refused_and_said_to_be_overrides(tmp_path: Path) ->
         ({"primal": ["decorelated"]}, "did you mean 'decorrelated'"),
     ]  # fmt: skip
     for overrides, words in cases:
-        line = refusal(write_study(tmp_path), overrides)
+        line = refusal(read_study, write_study(tmp_path), overrides)
         assert "options of the command line" in line
         assert words in line
 
@@ -301,4 +293,4 @@ def test_no_mutation_of_a_study_raises_anything_but_a_refusal(data: st.DataObjec
 def test_no_file_raises_anything_but_a_refusal(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "study.toml"
     path.write_bytes(content)
-    assert refusal(str(path)).startswith(f"{path}: ")
+    assert refusal(read_study, str(path)).startswith(f"{path}: ")
