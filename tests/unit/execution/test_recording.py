@@ -11,15 +11,7 @@ from samples import cell_row, changed, write_study
 
 from vibench import RequestError, Stop
 from vibench.execution import recording
-from vibench.execution.recording import (
-    axis_columns,
-    cell_columns,
-    claimed,
-    clear,
-    ended_by_smaller_limits,
-    labels_of,
-    refute,
-)
+from vibench.execution.recording import axis_columns, cell_columns, claimed, clear, labels_of
 from vibench.results.database import ResultsDatabase
 from vibench.results.schema import KEYS, STORED
 from vibench.results.sqlite import FILE
@@ -112,12 +104,12 @@ def test_cells_ended_by_a_limit_of_their_row_are_run_again_where_it_is_larger(da
         ({"memory_gib": 9.0, "query_seconds": 1.0}, {"large"}),
         ({"memory_gib": 9.0, "cell_seconds": 601.0}, {"slow", "both", "large"}),
     ):  # fmt: skip
-        assert ended_by_smaller_limits(database, BEFORE.model_copy(update=limits)) == again
+        assert recording.ended_by_smaller_limits(database, BEFORE.model_copy(update=limits)) == again
     larger = BEFORE.model_copy(update={"cell_seconds": 700.0})
     database.keep("limits of after", larger.model_dump_json())
     database.write_cell({"cell": "slow", "study_hash": "after", "status": "timeout"}, [])
-    assert ended_by_smaller_limits(database, larger) == {"both"}
-    assert ended_by_smaller_limits(database, BEFORE) == set()
+    assert recording.ended_by_smaller_limits(database, larger) == {"both"}
+    assert recording.ended_by_smaller_limits(database, BEFORE) == set()
 
 
 def test_a_refuted_bound_refutes_all_bounds_of_its_problem_and_no_other(database: ResultsDatabase) -> None:
@@ -125,7 +117,7 @@ def test_a_refuted_bound_refutes_all_bounds_of_its_problem_and_no_other(database
     for key, changes in {"a": {"bounds": 1}, "b": refuted, "c": {"bounds": 0}, "d": {"bounds": 1, "problem": "other"},
                          "e": {"bounds": 1, "status": "failed", "reason": "no"}}.items():  # fmt: skip
         database.write_cell(cell_row() | {"cell": key} | changes, [])
-    refute(database)
+    recording.refute(database)
     cells = {row["cell"]: (row["status"], row["reason"]) for row in database.rows("cells")}
     assert cells["a"] == ("refuted", "as the bounds of cell b: the error of λ is 2 times its bound")
     assert [cells[key][0] for key in "bcde"] == ["refuted", "ok", "ok", "failed"]

@@ -10,18 +10,8 @@ from numerics import exact, spd
 from samples import SOLVERS_OF_TESTS
 
 from vibench import MEMBERS, ParameterBox, QPSolution, Status, VariationalInequality, solve_qp
-from vibench.qp import verification
-from vibench.qp.scaling import (
-    drive,
-    in_units,
-    near_rows,
-    nearby,
-    random_units,
-    row_norms,
-    stiffness,
-    units_of,
-    units_of_dual,
-)
+from vibench.qp import scaling, verification
+from vibench.qp.scaling import near_rows, row_norms, units_of
 from vibench.stages.query import ProgramQuery
 
 seeds = st.integers(0, 10_000)
@@ -57,7 +47,7 @@ def test_scaling_back_is_exact(seed: int, length: int, modulus: int, load: str) 
 def test_a_dual_program_is_scaled_as_any_other(seed: int, count: int, loaded: bool) -> None:
     rng = np.random.default_rng(seed)
     dual = VariationalInequality(spd(count, rng), rng.standard_normal(count), -np.eye(count), np.zeros(count))
-    units = units_of_dual(dual, loaded)
+    units = scaling.units_of_dual(dual, loaded)
     for name in MEMBERS:
         assert np.array_equal(getattr(units.scaled_dual(dual), name), getattr(units.scaled(dual), name)), name
 
@@ -70,11 +60,11 @@ def test_the_scaled_program_knows_no_units(load: str, seed: int, length: int, mo
     for name in MEMBERS:
         assert np.allclose(getattr(there, name), getattr(here, name), rtol=1e-9, atol=1e-12), name
     assert np.abs(here.f).max() == pytest.approx(1.0) or load != "load"
-    driven = drive(other, row_norms(other.B))
+    driven = scaling.drive(other, row_norms(other.B))
     assert driven.loaded == (load == "load")
     if not driven.loaded:
         assert driven.length == pytest.approx(0.3 * 10.0**length)  # the depth of what is violated, not the farthest gap
-        assert driven.force == pytest.approx(0.3 * 10.0 ** (length + modulus) * stiffness(one.A))
+        assert driven.force == pytest.approx(0.3 * 10.0 ** (length + modulus) * scaling.stiffness(one.A))
 
 
 @given(seeds, st.floats(1.0, 1e12))
@@ -86,7 +76,7 @@ def test_far_constraints_have_no_part_in_the_units(seed: int, far: float) -> Non
     assert near_rows(beside)[-1] == (far <= 0.3e4)
     # nor do they turn a load into none
     loaded = VariationalInequality(np.eye(1), np.ones(1), np.ones((1, 1)), np.full(1, 1e15))
-    assert drive(loaded, np.ones(1)).loaded
+    assert scaling.drive(loaded, np.ones(1)).loaded
     assert verification.kkt_residuals(loaded, np.full(1, 0.5), np.zeros(1)).dual == 1.0
 
 
@@ -105,7 +95,7 @@ def test_sparse_and_zero_data_have_units_too() -> None:
         assert np.all(np.isfinite(units.scaled(vi).A))
     assert verification.kkt_residuals(unconstrained, np.zeros(2), np.zeros(0)).worst == 0.0
     dual = VariationalInequality(np.eye(1), np.zeros(1), -np.eye(1), np.zeros(1))
-    assert all(units_of_dual(dual, loaded).length > 0.0 for loaded in (True, False))
+    assert all(scaling.units_of_dual(dual, loaded).length > 0.0 for loaded in (True, False))
 
 
 def solved(vi: VariationalInequality, solver: str, form: str) -> QPSolution:
@@ -169,11 +159,11 @@ def test_in_other_units_it_is_the_same_program(n: int, m: int, accuracy: float, 
     root, B, g = rng.standard_normal((2 * n, n)), rng.standard_normal((m, n)), rng.random(m)
     A = root.T @ root
     program = VariationalInequality(A, rng.standard_normal(n), np.vstack([B, -B]), np.hstack([g, -g]))
-    d, again, other = (random_units(n, accuracy, seed, k) for k in (1, 1, 2))
+    d, again, other = (scaling.random_units(n, accuracy, seed, k) for k in (1, 1, 2))
     assert np.array_equal(d, again)
     assert not np.array_equal(d, other)
     assert 0.0 < np.abs(d - 1.0).max() <= 1e3 * accuracy
-    scaled = in_units(program, d)
+    scaled = scaling.in_units(program, d)
     assert np.array_equal(scaled.A, scaled.A.T)
     assert np.array_equal(scaled.B[:m], -scaled.B[m:])
     x = rng.standard_normal(n)
@@ -190,7 +180,7 @@ def test_in_other_units_it_is_the_same_program(n: int, m: int, accuracy: float, 
 def test_a_parameter_nearby_is_in_the_box(seed: int, one: float, other: float) -> None:
     box = ParameterBox(("a", "b"), np.array([-1.0, 1e6]), np.array([0.0, 3e6]), ("1", "1"))
     mu = box.lower + np.array([one, other]) * (box.upper - box.lower)
-    found = nearby(box, mu, seed)
+    found = scaling.nearby(box, mu, seed)
     assert np.all(box.lower <= found)
     assert np.all(found <= box.upper)
     assert not np.array_equal(found, mu)

@@ -10,18 +10,8 @@ from numerics import Varying, space
 
 from vibench.linalg.inner_product import RANK_RTOL, InnerProduct
 from vibench.reduction.supremizers import constraint_classes, supremizers
-from vibench.stability.infsup import (
-    ProjectedSupremizers,
-    beta_span,
-    cone_basis,
-    cone_interval,
-    entrywise_bound,
-    inf_sup_full,
-    inf_sup_on,
-    nodal_cone,
-    semidefinite_bounds,
-    simplex_minimiser,
-)
+from vibench.stability import infsup
+from vibench.stability.infsup import beta_span, cone_basis, cone_interval, inf_sup_full
 
 seeds = st.integers(0, 10_000)
 
@@ -84,8 +74,8 @@ def test_the_order_of_the_constants(mu: float) -> None:
     plain = V.orthonormalise(rng.standard_normal((30, 2)))
     own = np.hstack([plain, V.orthonormalise(supremizers(V, B, cone.span[:, :2]), plain)])
     online = np.hstack([plain, V.orthonormalise(supremizers(V, B, cone.span), plain)])
-    small, middle, large = (inf_sup_on(Z, B, cone) for Z in (plain, own, online))
-    full, hf = inf_sup_full(V, B, cone), inf_sup_full(V, B, nodal_cone(problem.W))
+    small, middle, large = (infsup.inf_sup_on(Z, B, cone) for Z in (plain, own, online))
+    full, hf = inf_sup_full(V, B, cone), inf_sup_full(V, B, infsup.nodal_cone(problem.W))
     for bigger, smaller in ((middle, small), (full, middle), (full, hf)):
         assert bigger.span >= smaller.span - 1e-12
         assert bigger.cone_upper >= smaller.cone_lower - 1e-12
@@ -102,7 +92,7 @@ def test_the_full_constant_against_the_dense_eigenproblem_and_for_nearly_paralle
     B = problem.assemble(np.array([0.7])).B
     S = (B @ np.linalg.solve(problem.V.matrix.toarray(), B.T.toarray())).astype(float)
     smallest = scipy.linalg.eigh(S, problem.W.matrix.toarray(), eigvals_only=True)[0]
-    found = inf_sup_full(problem.V, B, nodal_cone(problem.W))
+    found = inf_sup_full(problem.V, B, infsup.nodal_cone(problem.W))
     assert np.isclose(found.span, np.sqrt(smallest), rtol=1e-8)
     V, W = InnerProduct(sp.eye_array(6)), InnerProduct(sp.eye_array(4))
     B = sp.csr_array(np.eye(4, 6) * np.array([[1.0], [0.5], [0.1], [0.01]]))
@@ -122,7 +112,7 @@ def test_steps_are_the_smallest_constants_of_leading_parts(seed: int, first: int
     projected = [rng.standard_normal((first + 5, count)) for _ in classes.representatives]
     for block in projected:
         block[:, -1] = block[:, 0] + small * block[:, -1]
-    found = ProjectedSupremizers(projected, classes)
+    found = infsup.ProjectedSupremizers(projected, classes)
     pairs = list(zip(classes.members, classes.factors, strict=True))
     direct = np.array([[abs(c) * beta_span(projected[k][:r]) for k, c in pairs] for r in range(first, first + 6)])
     assert found.over_steps(first) == pytest.approx(direct.min(axis=1), rel=1e-12, abs=1e-14)
@@ -206,23 +196,23 @@ def test_hard_cases_are_known_to_one_percent() -> None:
 def test_certificates_hold_whatever_the_iterations_reached(seed: int, count: int) -> None:
     C, G = random_pair(seed, count, count, 0.2)
     M, exact = C.T @ C, minimum_by_faces(C.T @ C, G) ** 2
-    assert entrywise_bound(M, G) <= exact * (1.0 + 1e-9) + 1e-12
-    lower, upper = semidefinite_bounds(M, G, upper=np.inf, fraction=1.0)
+    assert infsup.entrywise_bound(M, G) <= exact * (1.0 + 1e-9) + 1e-12
+    lower, upper = infsup.semidefinite_bounds(M, G, upper=np.inf, fraction=1.0)
     assert lower <= exact * (1.0 + 1e-9) + 1e-12
     assert exact <= upper * (1.0 + 1e-9) + 1e-12
 
 
 def test_intervals_of_special_cases_and_rounded_zeros() -> None:
     """Neighbours touch, others do not; the products of the images are all positive."""
-    none = ProjectedSupremizers([np.zeros((4, 0))], constraint_classes([sp.csr_array(np.ones((2, 3)))]))
+    none = infsup.ProjectedSupremizers([np.zeros((4, 0))], constraint_classes([sp.csr_array(np.ones((2, 3)))]))
     assert none.over_steps(2).tolist() == [np.inf] * 3  # without multipliers nothing is unstable
     assert none.stability_ratios(2, np.array([np.inf])).tolist() == [1.0] * 3
     G = np.eye(4) + 0.3 * np.diag(np.ones(3), 1) + 0.3 * np.diag(np.ones(3), -1)
     M = np.ones((4, 4)) + np.diag([1.0, 2.0, 3.0, 4.0])
     for noise in (-1e-17, 1e-17):
-        assert entrywise_bound(M, np.where(G == 0.0, noise, G)) == 2.0
+        assert infsup.entrywise_bound(M, np.where(G == 0.0, noise, G)) == 2.0
     M[0, 3] = M[3, 0] = -0.1
-    assert entrywise_bound(M, G) == pytest.approx(2.0 - 4 * 0.1)
+    assert infsup.entrywise_bound(M, G) == pytest.approx(2.0 - 4 * 0.1)
     G = np.array([[1.0, 0.2], [0.2, 1.0]])
     # a point where the minimum sits on a generator
     assert cone_interval(np.array([[1.0, 0.9], [0.0, 1.5]]), G, 0.1) == (1.0, 1.0, "L½/U0")
@@ -240,7 +230,7 @@ def test_intervals_of_special_cases_and_rounded_zeros() -> None:
 @given(seeds)
 def test_the_simplex_minimiser_beats_every_other_point(seed: int) -> None:
     C, _ = random_pair(seed, 4, 5, 0.5)
-    alpha = simplex_minimiser(1e-3 * C)
+    alpha = infsup.simplex_minimiser(1e-3 * C)
     assert np.isclose(alpha.sum(), 1.0)
     assert np.all(alpha >= 0.0)
     others = np.random.default_rng(seed).dirichlet(np.ones(5), 200)

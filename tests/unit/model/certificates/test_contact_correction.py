@@ -10,12 +10,7 @@ from scipy.optimize import lsq_linear
 
 from vibench import Contact, DualSet, VariationalInequality
 from vibench.model.certificates import contact_correction
-from vibench.model.certificates.contact_correction import (
-    ContactCompliance,
-    ContactCorrection,
-    bounded_correction,
-    find_contact_correction,
-)
+from vibench.model.certificates.contact_correction import ContactCompliance, ContactCorrection, find_contact_correction
 
 K, M = 7, 6
 EVERY = np.arange(K)
@@ -44,8 +39,8 @@ def corrected(given: Program, near: np.ndarray = EVERY) -> ContactCorrection | N
 def test_corrections_for_intervals_are_the_best_ones_and_no_w_violates_anything(given: Program, radius: float) -> None:
     C, contact, u, lam, gamma = given
     bounded = DualSet.intervals(np.arange(M), radius)
-    lam = bounded.project(lam - 0.5)
-    found = bounded_correction(ContactCompliance(C, EVERY, 0.0), contact, u, np.zeros(K), lam, gamma, bounded)
+    lam, compliance = bounded.project(lam - 0.5), ContactCompliance(C, EVERY, 0.0)
+    found = contact_correction.bounded_correction(compliance, contact, u, np.zeros(K), lam, gamma, bounded)
     B, s, w = contact.B.toarray(), contact.B @ u - contact.g, C @ found.load
     assert found.kappa >= bounded.support(s - B @ w) - lam @ (s - B @ w) - 1e-14 * np.abs(s).sum() * radius
     assert found.norm == pytest.approx(float(np.sqrt(w @ np.linalg.solve(C, w))), rel=1e-6, abs=1e-12)
