@@ -313,8 +313,8 @@ def test_strategies_have_formulas_and_whatever_is_cited_is_in_the_bibliography()
 def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs are timed in one round, and nothing offline twice: for tests that look at no seconds."""
 
-    def plan(goals: Any, rounds: int, writer: Any, fewest: int) -> TimingPlan:
-        return TimingPlan(goals, min(rounds, 1), writer, min(fewest, 1))
+    def plan(goals: Any, rounds: int, writer: Any, fewest: int, share: float) -> TimingPlan:
+        return TimingPlan(goals, min(rounds, 1), writer, min(fewest, 1), share)
 
     monkeypatch.setattr(execution, "TimingPlan", plan)
     monkeypatch.setattr(OfflinePlan, "repeats", lambda self, cells: [])

@@ -187,7 +187,7 @@ def _study(request: str, key: str, overrides: dict[str, list[Any]], at: list[str
     cells = {cell.key: cell for cell in expand(study)}
     cell = cells[key_of(key, cells, request, f"vibench run {request} --dry-run")]
     # One cell is timed as often as in its study.
-    rounds = {name: getattr(study, name) for name in ("timing_rounds", "timing_rounds_min")}
+    rounds = {name: getattr(study, name) for name in ("timing_rounds", "timing_rounds_min", "timing_budget")}
     return study_of_cell(cell, study.name, limits=study.limits, **rounds)
 
 

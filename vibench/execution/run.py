@@ -190,7 +190,8 @@ class _Run:
         runnable = [cell for cell in todo if cell in goals]
         rounds, fewest = self.study.timing_rounds, self.study.timing_rounds_min
         requested = QUERY_SUBSETS * self.options.repeats
-        self.timing = TimingPlan(goals, max(rounds, requested), self.writer, max(fewest, requested))
+        share = self.study.timing_budget
+        self.timing = TimingPlan(goals, max(rounds, requested), self.writer, max(fewest, requested), share)
         self.offline = OfflinePlan(self.store, self.writer, max(self.options.repeats - 1, 0))
         untimed = self.timing.start(runnable)
         uncalibrated = self.writer.uncalibrated()
@@ -240,13 +241,14 @@ class _Run:
         if artefact is None or artefact.machine not in self.machines:
             return False
         self.offline.note(stage, artefact.seconds, 0.0)
+        self.timing.note(stage, artefact.seconds)
         self.writer.stage(stage, artefact.histories, self.store)
         return True
 
     def _loop(self, workers: Executor) -> None:
         running: dict[Future[Any], Stage] = {}
         limits = self.study.limits
-        while self.graph.waiting or running:
+        while self.graph.waiting or running or self._time_further(workers.slots):
             for stage in self.graph.begin(workers.slots - len(running)):
                 cell_seconds = stage.weight * limits.cell_seconds
                 folder, lost = str(self.store.folder), dict(self.lost)
@@ -283,10 +285,11 @@ class _Run:
                     self._fail_cell(cell, Failed(outcome.status, reason))
                     self._ended(cell)
             return
-        self.observer.stage(stage, outcome.wall)
+        self.observer.stage(stage, outcome.spent.wall)
+        self.timing.note(stage, outcome.spent)
         self.graph.done(stage)
         if stage.stored:
-            self.offline.note(stage, outcome.seconds, outcome.wall)
+            self.offline.note(stage, outcome.seconds, outcome.spent.wall)
             self.writer.stage(stage, outcome.histories, self.store)
         else:
             self._timed(stage, outcome.value)
@@ -319,8 +322,18 @@ class _Run:
 
     def _timed(self, stage: Stage, outcome: Any) -> None:
         if (following := self.timing.record(stage, outcome)) is not None:
-            self.graph.add_goal(following, self._is_available)
-            self.observer.plan(following)
+            self._plan(following)
+
+    def _time_further(self, count: int) -> bool:
+        """Plan rounds beyond the minimal ones, at most `count` blocks; returns whether there are any."""
+        blocks = self.timing.further(count)
+        for block in blocks:
+            self._plan(block)
+        return bool(blocks)
+
+    def _plan(self, block: TimingRounds) -> None:
+        self.graph.add_goal(block, self._is_available)
+        self.observer.plan(block)
 
     def _fail_cell(self, cell: Cell, failed: Failed) -> None:
         ended = {"status": failed.status.value, "reason": failed.reason}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from operator import itemgetter
 
 from vibench.execution.recording import ResultWriter
 from vibench.results.break_even import Meaning, compared, scatter
@@ -93,20 +94,33 @@ class _Group:
         self.failures: dict[str, list[Failed]] = defaultdict(list)
         # Numbers of the next block and of the next round.
         self.blocks = self.first = 0
+        # CPU seconds of a round of one cell, in the last block.
+        self.seconds = 0.0
+        # Whether it has the minimal rounds, so that others are optional.
+        self.is_timed = False
 
 
 class TimingPlan:
     """The groups of a run: the cells that break-even compares, of one problem, cone and pair of tolerances.
 
     A group is timed whole, even where only some of its cells are new: seconds of different runs are not comparable.
-    Each block of rounds is planned when the previous one has ended, without the cells whose comparisons are decided.
+    Every cell gets the minimal rounds. Groups with undecided comparisons get further blocks when all else is done, that
+    with the nearest decision first, until these have taken their share of the seconds of a run.
 
     `goals` are the last stages of the cells that can be timed here, `rounds` is the upper limit of rounds, `fewest` the
-    number of rounds of every cell if the limit allows them.
+    number of rounds of every cell if the limit allows them, `share` the fraction of all other CPU seconds that further
+    rounds may take.
     """
 
-    def __init__(self, goals: Mapping[Cell, CellQueries], rounds: int, writer: ResultWriter, fewest: int) -> None:
+    def __init__(
+        self, goals: Mapping[Cell, CellQueries], rounds: int, writer: ResultWriter, fewest: int, share: float
+    ) -> None:
         self._goals, self._rounds, self._writer, self._fewest = goals, rounds, writer, fewest
+        self._share = share
+        # CPU seconds of further rounds and of all else so far.
+        self._spent = self._others = 0.0
+        # The groups that further rounds may decide: the seconds to the nearest decision, and the cells to be timed.
+        self._held: list[tuple[float, _Group, list[CellQueries]]] = []
         # All measurements so far: the scatter of the few blocks of a cell is pooled with that of other cells.
         self._paired = PairedTiming()
         self._groups: dict[tuple[object, ...], list[Cell]] = {}
@@ -140,6 +154,29 @@ class TimingPlan:
         fine = {goal.key: self._writer.database.fine_queries(cell.key) for cell, goal in members.items()}
         return self._block(_Group(members, fine), self._session, members.values())
 
+    def note(self, stage: Stage, spent: Seconds) -> None:
+        """Register the seconds of a stage that has run, or whose artefact was reused."""
+        if isinstance(stage, TimingRounds):
+            group = self._planned[stage.key]
+            group.seconds = spent.cpu / stage.items
+            if group.is_timed:
+                self._spent += spent.cpu
+                return
+        self._others += spent.cpu
+
+    def further(self, count: int) -> list[TimingRounds]:
+        """Blocks beyond the minimal rounds within the budget, at most `count`: those of the nearest decisions."""
+        blocks, left = list[TimingRounds](), self._share * self._others - self._spent
+        for held in sorted(self._held, key=itemgetter(0)):
+            _, group, goals = held
+            cost = group.seconds * len(goals) * block_sizes(self._rounds)[group.blocks]
+            if len(blocks) < count and cost <= left:
+                left -= cost
+                self._held.remove(held)
+                # A session of its own: any process may have timed this group before.
+                blocks.append(self._block(group, self._session + 1, goals))
+        return blocks
+
     def _block(self, group: _Group, session: int, goals: Iterable[CellQueries]) -> TimingRounds:
         # Cells that differ only in their labels share one goal.
         mine = tuple({goal.key: goal for goal in goals}.values())
@@ -150,7 +187,7 @@ class TimingPlan:
         return stage
 
     def record(self, stage: Stage, outcome: tuple[TimedCell, ...] | Failed) -> TimingRounds | None:
-        """Write the seconds of a block, or why there are none; returns the next block of its group, if any."""
+        """Write the seconds of a block, or why there are none; returns the next of the minimal rounds, if any."""
         # A stage that is not of this plan is ignored.
         if not isinstance(stage, TimingRounds):
             return None
@@ -176,22 +213,27 @@ class TimingPlan:
                 self._paired.add(cell.key, rows)
         # A goal without a single round in this block would fail again.
         timed_now = {goal.key for goal, timed in zip(stage.cells, outcome, strict=True) if timed.rounds}
-        following = [goal for goal in self._undecided(group) if goal.key in timed_now]
-        if following and group.blocks < len(block_sizes(self._rounds)):
-            return self._block(group, stage.session + 1, following)
+        if timed_now and group.blocks < len(block_sizes(self._rounds)):
+            if group.first < min(max(self._fewest, FEWEST_ROUNDS), self._rounds) or group.blocks < 2:
+                following = [goal for goal in group.members.values() if goal.key in timed_now]
+                return self._block(group, stage.session + 1, following)
+            distance, undecided = self._undecided(group)
+            if following := [goal for goal in undecided if goal.key in timed_now]:
+                self._held.append((distance * len(following) * group.seconds, group, following))
+        # An interrupted run does not wait for further rounds, either.
         for cell in group.members:
             self._writer.database.write_columns(cell.key, {"timing_rounds": self._rounds})
         return None
 
-    def _undecided(self, group: _Group) -> list[CellQueries]:
-        """The goals with a comparison that further rounds may decide."""
-        if group.first < min(max(self._fewest, FEWEST_ROUNDS), self._rounds) or group.blocks < 2:
-            return list(group.members.values())
+    def _undecided(self, group: _Group) -> tuple[int, list[CellQueries]]:
+        """How many rounds the nearest decision is away, and the goals with comparisons that rounds may decide."""
         cells = {cell.key: goal for cell, goal in group.members.items()}
         rows = [row for key in cells if (row := self._writer.database.cell(key)) is not None]
-        undecided: dict[str, CellQueries] = {}
-        # A comparison that is tested after every block reaches 5 % only if each test is stricter (Pocock 1977).
-        for one in compared(rows, self._paired, tail=0.005):
+        undecided, nearest = dict[str, CellQueries](), self._rounds
+        # A comparison that is tested after every block reaches 5 % only if each test is stricter. The first one spends
+        # half of that, since few comparisons need another (Lan and DeMets 1983).
+        tail, group.is_timed = 0.005 if group.is_timed else 0.0125, True
+        for one in compared(rows, self._paired, tail):
             # Only the seconds of queries, and no offline ones, may be decided by more rounds; their number is an
             # estimate, for which twice the limit allows.
             more = one.result.rounds
@@ -199,7 +241,8 @@ class TimingPlan:
             if one.result.meaning is Meaning.UNDECIDED and would_help:
                 both = [one.b["cell"]] if one.a is None else [one.a["cell"], one.b["cell"]]
                 undecided |= {key: cells[key] for key in both}
-        return list(undecided.values())
+                nearest = min(nearest, more or 0)
+        return nearest, list(undecided.values())
 
 
 def block_sizes(rounds: int) -> list[int]:

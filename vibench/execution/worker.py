@@ -10,7 +10,6 @@ import resource
 import socket
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, partial
@@ -29,6 +28,7 @@ from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Items, ItemwiseStage, Unstored
 from vibench.stages.snapshots import unchanged
+from vibench.timing import Stopwatch
 
 T = TypeVar("T")
 Send = Callable[[Any], None]
@@ -94,7 +94,7 @@ def perform(
     job: Job, progress: Progress, batch: Batch, send: Send, enter: Enter
 ) -> Done | supervisor.BatchDone | Failed | Unstored | supervisor.OutOfMemory:
     """Run a batch of a stage; an exception of a plugin fails the stage and not the run."""
-    start = time.perf_counter()
+    watch = Stopwatch()
 
     def work() -> Done | supervisor.BatchDone:
         _check_code(job, batch)
@@ -106,7 +106,7 @@ def perform(
             with unchanged(job.stage):
                 result = job.stage.run(store)
             store.put(job.stage.key, result.value, result.seconds, result.histories)
-            return Done(result.histories, None, time.perf_counter() - start, result.seconds)
+            return Done(result.histories, None, watch.seconds(), result.seconds)
         with unchanged(job.stage):
             if job.stage.key not in _last:
                 _last.clear()
@@ -120,7 +120,7 @@ def perform(
             value = items.collect([done[number] for number in range(job.stage.items)])
         if job.stage.has_failed(value) and job.stage.packages:
             _failed.append(job.stage.key)
-        return Done((), value, time.perf_counter() - start)
+        return Done((), value, watch.seconds())
 
     try:
         return _guarded(job, work)

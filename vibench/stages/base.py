@@ -54,11 +54,11 @@ class Result:
 
 @dataclass(frozen=True)
 class Done:
-    """A stage that succeeded: its histories, its value where that is not stored, wall seconds in all and its own."""
+    """A stage that succeeded: its histories, its value where that is not stored, seconds in all and its own."""
 
     histories: tuple[History, ...]
     value: Any
-    wall: float
+    spent: Seconds
     seconds: Seconds = NO_TIME
 
 

@@ -31,7 +31,7 @@ from vibench.timing import NO_TIME, Seconds, calibration, is_disturbed, timed
 # A round takes a third of the queries of a cell, another one each time: short rounds interleave more closely.
 QUERY_SUBSETS = 3
 # CPU seconds of full assemblies after which no further one is timed in a cell's part of a round.
-ASSEMBLY_SECONDS = 0.02
+ASSEMBLY_SECONDS = 0.01
 
 
 @dataclass(frozen=True)

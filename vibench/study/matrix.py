@@ -229,7 +229,7 @@ def _solved(study: Study, entry: FormulationEntry) -> list[tuple[tuple[str, bool
 
 def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
     """The study of a single cell, with the same key."""
-    # `settings` do not determine its numbers: `timing_rounds`, `timing_rounds_min`, `limits`.
+    # `settings` do not determine its numbers: `timing_rounds`, `timing_rounds_min`, `timing_budget`, `limits`.
     tolerances: dict[str, Any] = dict([_stop("pod", "N", cell.pod), _stop("dual", "R", cell.cone)])
     if cell.primal_tol is not None:
         tolerances["primal"] = {cell.labels[2]: [cell.primal_tol]}

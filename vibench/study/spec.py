@@ -332,6 +332,11 @@ class Study(_Model):
         default=FEWEST_ROUNDS,
         description="Minimal number of timing rounds, after which a cell with decided comparisons ends.",
     )
+    timing_budget: Annotated[float, Ge(0.0), Le(100.0)] = Field(
+        default=0.25,
+        description="CPU seconds of rounds beyond the minimal ones at most, as a fraction of all other CPU seconds of "
+        "the run.",
+    )
     factorisation: Literal["superlu", "pardiso", "cholmod", "multigrid", "available"] = Field(
         default="superlu",
         description="Factorisation of high-fidelity matrices; a problem may have an option of the same name.",

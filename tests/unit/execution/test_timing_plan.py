@@ -34,7 +34,7 @@ def writer(tmp_path: Path) -> ResultWriter:
 
 
 def plan_of(writer: ResultWriter, rounds: int = 12) -> TimingPlan:
-    return TimingPlan({cell: cell_queries(cell, 20.0) for cell in CELLS}, rounds, writer, 0)
+    return TimingPlan({cell: cell_queries(cell, 20.0) for cell in CELLS}, rounds, writer, 0, 0.25)
 
 
 def write(writer: ResultWriter, cell: Cell, *failed: int, **columns: object) -> None:
@@ -69,7 +69,7 @@ def record(plan: TimingPlan, stage: TimingRounds | None, unsteady: float = 0.0) 
     stages = []
     while stage is not None:
         stages.append(stage)
-        stage = plan.record(stage, timed(stage, unsteady))
+        stage = plan.record(stage, timed(stage, unsteady)) or next(iter(plan.further(1)), None)
     return stages
 
 
@@ -160,9 +160,33 @@ def test_rounds_end_where_a_decision_would_take_far_too_many(writer: ResultWrite
 def test_as_many_rounds_as_are_asked_for_at_least(writer: ResultWriter) -> None:
     for cell in GROUP:
         write(writer, cell)
-    plan = TimingPlan({cell: cell_queries(cell, 20.0) for cell in CELLS}, 60, writer, 15)
+    plan = TimingPlan({cell: cell_queries(cell, 20.0) for cell in CELLS}, 60, writer, 15, 0.25)
     (stage,) = plan.start([])
     assert [len(one.cells) for one in record(plan, stage)] == [len(GROUP)] * 5
+
+
+def test_further_rounds_wait_for_all_else_and_take_a_share_of_its_seconds(writer: ResultWriter) -> None:
+    """A group is nearer to a decision where a round takes fewer seconds."""
+    for cell in CELLS:
+        if cell.problem.name == "hertz":
+            write(writer, cell)
+    plan, others = plan_of(writer, 18), 0.0
+    for first, seconds in zip(plan.start([]), (5.0, 1.0), strict=True):
+        stage: TimingRounds | None = first
+        while stage is not None:
+            others += seconds * stage.items
+            plan.note(stage, spent(seconds * stage.items))
+            stage = plan.record(stage, timed(stage, 0.14))
+    affordable = plan.further(2)
+    assert sum(one.items for one in affordable) <= 0.25 * others
+    assert all(set(one.cells) <= {cell_queries(cell, 20.0) for cell in GROUP} for one in affordable)
+    assert [one.session for one in affordable] == [2]
+    plan.note(affordable[0], spent(0.25 * others))
+    plan.record(affordable[0], timed(affordable[0], 0.14))
+    assert plan.further(2) == []
+    plan.note(ExactSolutions(GOAL.assembly), spent(1e6))
+    assert [one.session for one in plan.further(2)] == [3, 4]
+    assert plan.further(2) == []
 
 
 def test_a_group_that_was_not_timed_to_the_end_is_timed_again(writer: ResultWriter) -> None:
@@ -224,7 +248,7 @@ def test_a_group_costs_the_same_however_many_there_are() -> None:
         writer: Any = SimpleNamespace(database=database, seconds=lambda *_: None)
 
         def work() -> None:
-            plan = TimingPlan(goals, 1, writer, 0)
+            plan = TimingPlan(goals, 1, writer, 0, 0.25)
             plan.start(cells)
             for cell in cells:
                 if (stage := plan.ended(cell)) is not None:
