@@ -3,7 +3,8 @@
 python results/scripts/everything.py FOLDER
 
 Runs are kept in FOLDER/runs, pages are written into FOLDER/results, FOLDER/docs and FOLDER/README.md. A study that
-several pages need runs once. `--list` as FOLDER prints the commands.
+several pages need runs once. FOLDER/done.txt lists what has ended: after an interruption, the same command goes on.
+`--list` as FOLDER prints the commands.
 """
 
 from __future__ import annotations
@@ -44,13 +45,21 @@ def main(folder: str) -> None:
     if folder == "--list":
         print("\n".join(commands()))
         return
-    target = Path(folder)
-    for part in ("results", "docs", "tests", "examples"):
-        shutil.copytree(ROOT / part, target / part, dirs_exist_ok=True)
-    shutil.copy(ROOT / "README.md", target)
+    target, done = Path(folder), Path(folder) / "done.txt"
+    if not done.exists():
+        for part in ("results", "docs", "tests", "examples"):
+            shutil.copytree(ROOT / part, target / part, dirs_exist_ok=True)
+        shutil.copy(ROOT / "README.md", target)
+        # Its script keeps the rows that its table has.
+        (target / "results" / "calibration" / "chains.csv").unlink()
+        done.touch()
+    ended = done.read_text(encoding="utf-8").splitlines()
     for command in commands():
-        print(command, flush=True)
-        subprocess.run(command, shell=True, check=True, cwd=target, env=os.environ)
+        if command not in ended:
+            print(command, flush=True)
+            subprocess.run(command, shell=True, check=True, cwd=target, env=os.environ)
+            with done.open("a", encoding="utf-8") as file:
+                file.write(f"{command}\n")
 
 
 def commands() -> Iterator[str]:
