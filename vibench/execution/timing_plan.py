@@ -96,8 +96,8 @@ class _Group:
         self.blocks = self.first = 0
         # CPU seconds of a round of one cell, in the last block.
         self.seconds = 0.0
-        # Whether it has the minimal rounds, so that others are optional.
-        self.is_timed = False
+        # The comparisons that the minimal rounds and later blocks have left undecided, `None` before.
+        self.undecided: set[tuple[str, ...]] | None = None
 
 
 class TimingPlan:
@@ -159,7 +159,7 @@ class TimingPlan:
         if isinstance(stage, TimingRounds):
             group = self._planned[stage.key]
             group.seconds = spent.cpu / stage.items
-            if group.is_timed:
+            if group.undecided is not None:
                 self._spent += spent.cpu
                 return
         self._others += spent.cpu
@@ -229,20 +229,22 @@ class TimingPlan:
         """How many rounds the nearest decision is away, and the goals with comparisons that rounds may decide."""
         cells = {cell.key: goal for cell, goal in group.members.items()}
         rows = [row for key in cells if (row := self._writer.database.cell(key)) is not None]
-        undecided, nearest = dict[str, CellQueries](), self._rounds
+        chosen, nearest, undecided = dict[str, CellQueries](), self._rounds, set[tuple[str, ...]]()
         # A comparison that is tested after every block reaches 5 % only if each test is stricter. The first one spends
         # half of that, since few comparisons need another (Lan and DeMets 1983).
-        tail, group.is_timed = 0.005 if group.is_timed else 0.0125, True
-        for one in compared(rows, self._paired, tail):
+        for one in compared(rows, self._paired, tail=0.0125 if group.undecided is None else 0.005):
+            pair = (one.b["cell"],) if one.a is None else (one.a["cell"], one.b["cell"])
             # Only the seconds of queries, and no offline ones, may be decided by more rounds; their number is an
             # estimate, for which twice the limit allows.
             more = one.result.rounds
             would_help = one.gain is None or (more is not None and group.first + more <= 2.0 * self._rounds)
-            if one.result.meaning is Meaning.UNDECIDED and would_help:
-                both = [one.b["cell"]] if one.a is None else [one.a["cell"], one.b["cell"]]
-                undecided |= {key: cells[key] for key in both}
+            was_decided = group.undecided is not None and pair not in group.undecided
+            if one.result.meaning is Meaning.UNDECIDED and would_help and not was_decided:
+                undecided.add(pair)
+                chosen |= {key: cells[key] for key in pair}
                 nearest = min(nearest, more or 0)
-        return nearest, list(undecided.values())
+        group.undecided = undecided
+        return nearest, list(chosen.values())
 
 
 def block_sizes(rounds: int) -> list[int]:

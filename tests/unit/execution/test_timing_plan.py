@@ -1,4 +1,5 @@
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -146,6 +147,7 @@ def test_rounds_end_for_the_cells_whose_comparisons_are_decided(writer: ResultWr
     assert [len(one.cells) for one in stages[:2]] == [len(GROUP)] * 2
     compared = {cell_queries(cell, 20.0) for cell in GROUP if cell.primal.name != "decorrelated"}
     assert all(set(one.cells) <= compared for one in stages[2:])
+    assert all(set(later.cells) <= set(one.cells) for one, later in pairwise(stages))
     counts = {(cell.primal.name, (writer.database.cell(cell.key) or {})["timed_rounds"]) for cell in GROUP}
     assert {count for name, count in counts if name == "decorrelated"} == {6}
     assert max(count for _, count in counts) == 3 * len(stages)
