@@ -10,6 +10,7 @@ from datetime import date, time
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar, cast
 
+import numpy as np
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import (
     AfterValidator,
@@ -22,6 +23,7 @@ from pydantic import (
     PrivateAttr,
     Tag,
     ValidationError,
+    field_validator,
     model_validator,
 )
 
@@ -56,6 +58,14 @@ def _is_plain(value: Any) -> bool:
 class _Model(BaseModel):
     # Unknown keys, infinities and NaN are refused, and no type is converted.
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_array(cls, value: Any) -> Any:
+        # The validation takes whatever has `__float__` for a number, and so an array of one entry.
+        if isinstance(value, np.ndarray):
+            raise ValueError(f"is an array of shape {value.shape}, expected a value of a study file")
+        return value
 
 
 class Entry(_Model):
