@@ -150,13 +150,13 @@ class InnerProduct:
         self._refuse_others(functional)
         return self._factor.solve_factor_transposed(functional)
 
-    def coordinates(self, u: Array) -> tuple[Array, Callable[[Array], Array]]:
-        """Euclidean coordinates of u (n×k) and the map from them: whitened ones, by iteration those in span(u)."""
+    def coordinates(self, u: Array) -> tuple[Array, Array | None]:
+        """Euclidean coordinates of u (n×k): whitened ones, or by iteration those in a basis (n×k), given second."""
         if not implementation(self.factorisation).is_iterative:
-            return self.whiten(u), self.unwhiten
+            return self.whiten(u), None
         self._refuse_others(u)
         q, r = orthogonal_factorisation(self.matrix, u)
-        return r, lambda y: q @ y
+        return r, q
 
     def orthonormalise(self, u: Array, against: Array | None = None) -> Array:
         """Orthonormal basis (n×r) of span(u), u (n×k), or of its part orthogonal to orthonormal `against` (n×l).

@@ -36,7 +36,7 @@ def pod(snapshots: Annotated[Array, "n", "P"], V: Annotated[InnerProduct, "n"], 
     """
     if not snapshots.shape[1]:
         return POD(np.zeros((V.dim, 0)), np.zeros(1))
-    coordinates, vectors = V.coordinates(snapshots)
+    coordinates, span = V.coordinates(snapshots)
     left, sigma, _ = svd(coordinates)
     total = float(np.linalg.norm(sigma))
     tails = np.append(np.sqrt(np.cumsum((sigma**2)[::-1])[::-1]), 0.0)
@@ -48,4 +48,5 @@ def pod(snapshots: Annotated[Array, "n", "P"], V: Annotated[InnerProduct, "n"], 
     modes = left[:, :size]
     # The sign of a singular vector is arbitrary: make the largest entry positive.
     signs = np.where(np.take_along_axis(modes, np.abs(modes).argmax(axis=0)[None], axis=0)[0] < 0.0, -1.0, 1.0)
-    return POD(vectors(modes * signs), errors)
+    modes = modes * signs
+    return POD(V.unwhiten(modes) if span is None else span @ modes, errors)

@@ -92,13 +92,16 @@ class SpannedCoordinates:
     """
 
     def __init__(self, V: InnerProduct, basis: Array, vectors: Array) -> None:
-        coordinates, self._vectors = V.coordinates(np.hstack([basis, vectors]))
+        # What is stored holds no functions.
+        self._V = V
+        coordinates, self._span = V.coordinates(np.hstack([basis, vectors]))
         self._whitened, self.represented = _beside(*np.split(coordinates, [basis.shape[1]], axis=1))
         self.plain: Array = np.eye(self._whitened.shape[1], basis.shape[1])
 
     def vectors(self, coordinates: Array) -> Array:
         """Vectors (n×k) with these coordinates (d×k)."""
-        return self._vectors(self._whitened @ coordinates)
+        y = self._whitened @ coordinates
+        return self._V.unwhiten(y) if self._span is None else np.asarray(self._span @ y)
 
 
 class ContactCoordinates:

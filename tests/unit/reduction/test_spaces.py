@@ -14,6 +14,7 @@ from scipy.optimize import nnls
 from vibench import Array, ContactLoads, NumericalError, Offline, ReducedSet, RequestError, Stop, Study, no_free, pod
 from vibench.reduction import Cubature, cubature, supremizers
 from vibench.reduction.nested import NestedStrategy, Step, grow_through
+from vibench.stages.artefacts import dumps, loads
 from vibench.study.matrix import expand
 
 
@@ -37,6 +38,7 @@ def test_coordinates_are_an_isometry_that_leads_back_to_the_supremizers(count: i
     assert isinstance(space, supremizers.SpannedCoordinates if count == 1 else supremizers.ContactCoordinates)
     assert np.allclose(space.plain.T @ space.plain, np.eye(4), atol=1e-12)
     assert np.allclose(space.vectors(space.plain), basis, atol=1e-11)
+    assert np.array_equal(loads(dumps(space)).vectors(space.plain), space.vectors(space.plain))
     for B, coordinates in zip(matrices, found, strict=True):
         direct = supremizers.supremizers(problem.V, B, eta)
         assert np.allclose(space.vectors(coordinates), direct, atol=1e-11)
