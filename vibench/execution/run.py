@@ -145,6 +145,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options) 
         database = ResultsDatabase(folder, identity(study), anew=options.fresh)
         try:
             repeated, finished = ended_by_smaller_limits(database, study.limits), database.finished()
+            repeated |= _no_longer_missing(database, cells)
             if options.retry:
                 repeated |= {key for key, (status, _) in finished.items() if status != Status.OK}
             kept = {key: code for key, (_, code) in finished.items() if key not in repeated}
@@ -339,6 +340,12 @@ class _Run:
         ended = {"status": failed.status.value, "reason": failed.reason}
         row = ended | {"queries": cell.validation.count, "queries_ok": 0}
         self.observer.cell(cell, self.writer.cell(cell, CellRows(row, ())))
+
+
+def _no_longer_missing(database: ResultsDatabase, cells: Sequence[Cell]) -> set[str]:
+    """Keys of the cells whose row says that something is not installed, which is by now."""
+    lacked = {key for key, *_, reason in database.ends() if "not installed" in reason or "cannot be imported" in reason}
+    return {cell.key for cell in cells if cell.key in lacked and not unavailable(cell)}
 
 
 def unavailable(cell: Cell) -> str:

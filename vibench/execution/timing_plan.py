@@ -220,7 +220,7 @@ class TimingPlan:
             distance, undecided = self._undecided(group)
             if following := [goal for goal in undecided if goal.key in timed_now]:
                 self._held.append((distance * len(following) * group.seconds, group, following))
-        # An interrupted run does not wait for further rounds, either.
+        # A group is complete without further rounds: a run that was interrupted amid these times none again.
         for cell in group.members:
             self._writer.database.write_columns(cell.key, {"timing_rounds": self._rounds})
         return None

@@ -11,6 +11,7 @@ import pytest
 from rich import jupyter
 
 import vibench
+from vibench.execution import run as execution
 from vibench.execution.run import Agenda, Observer
 from vibench.library.progress import ProgressDisplay
 from vibench.report import figures
@@ -62,6 +63,19 @@ def test_a_run_is_continued_and_followed(run: vibench.Run, capsys: pytest.Captur
     assert not capsys.readouterr().out
     vibench.run(vibench.Study(**SETTINGS), run.path.parent)
     assert "2 cells, 0 to run" in capsys.readouterr().out
+
+
+def test_what_was_not_installed_is_run_once_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    study = vibench.Study(**SETTINGS | {"solvers": ["piqp", "daqp"]})
+    with monkeypatch.context() as patch:
+        patch.setattr(execution, "installed_solvers", lambda registered: ["piqp"])
+        patch.setattr(execution.provenance, "solver_version", lambda solver: None)
+        before = vibench.run(study, tmp_path, progress=False, jobs=1).cells
+    assert dict(before.groupby("solver")["status"].agg(set)) == {"piqp": {"ok"}, "daqp": {"unavailable"}}
+    observer = following()
+    after = vibench.run(study, tmp_path, observer=observer, jobs=1).cells
+    assert set(after["status"]) == {"ok"}
+    assert observer.start.call_args[0][0].to_run == 2
 
 
 def test_figures_and_findings_are_there_and_wrong_requests_one_line(run: vibench.Run) -> None:
