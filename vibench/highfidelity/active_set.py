@@ -101,9 +101,17 @@ class HighFidelitySolver:
 
         Raises a `NumericalError` that names mu, and what A lacks if that is the cause.
         """
+        nearest: Mask | None = None
+        if self._active:
+            distances = np.linalg.norm((np.array(self._solved) - mu) / self._width, axis=1)
+            nearest = self._active[int(np.argmin(distances))]
+        return self.solve_from(nearest, mu, vi)
+
+    def solve_from(self, nearest: Mask | None, mu: OfBox, vi: VariationalInequality) -> ActiveSetSolution:
+        """As `solve_assembled`, from the contact set of another parameter (m,) or from none."""
         refuse_blocks(vi.K, [BlockKind.INTERVAL], "the active set method")
         with at_parameter(mu), _explained(vi, f"A at mu = {mu.tolist()}"):
-            return solve_unverified(vi, self.condensed(vi), self._start(mu))
+            return solve_unverified(vi, self.condensed(vi), self._start(mu, nearest))
 
     def verify(self, mu: OfBox, vi: VariationalInequality, unverified: ActiveSetSolution) -> HighFidelitySolution:
         """The solution of `vi`, which has to be the variational inequality solved last, at mu (d,), verified.
@@ -133,12 +141,8 @@ class HighFidelitySolver:
         self._solved.clear()
         self._active.clear()
 
-    def _start(self, mu: Array) -> Mask | None:
+    def _start(self, mu: Array, nearest: Mask | None) -> Mask | None:
         """The initial active set, which the problem derives from the contact set of the nearest parameter."""
-        nearest: Mask | None = None
-        if self._active:
-            distances = np.linalg.norm((np.array(self._solved) - mu) / self._width, axis=1)
-            nearest = self._active[int(np.argmin(distances))]
         with factorised_later():
             start, m = self._problem.start(mu.copy(), nearest), self._W.dim
             if isinstance(start, NestedStart) and (self._coarse is None or self._coarse._problem is not start.coarse):

@@ -11,7 +11,7 @@ import numpy as np
 
 from vibench.arrays import Array, Mask
 from vibench.errors import NumericalError
-from vibench.highfidelity.active_set import HighFidelitySolver, solve_unverified
+from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.qp.scaling import nearby
@@ -42,9 +42,10 @@ class MarginalSolutions:
         """One solution with its assembly, at another parameter next to its own for every seed."""
         # It has no seconds if it fails or differs from the solution of this parameter.
         assembled = self.assemble(number, *seed)
-        vi = assembled.vi
+        mu, vi = self._next_to(number, *seed), assembled.vi
         try:
-            solution, rest = timed(lambda: solve_unverified(vi, self._solver.condensed(vi), self._starts[number]))
+            # The problem may derive another start from that contact set, as it does in the sweep.
+            solution, rest = timed(lambda: self._solver.solve_from(self._starts[number], mu, vi))
         except NumericalError:
             return assembled
         distance = float(self._problem.V.norm(solution.u - self._u[:, number]))
@@ -52,8 +53,11 @@ class MarginalSolutions:
 
     def assemble(self, number: int, *seed: int) -> MarginalSolution:
         """The assembly of a solution, without it."""
-        mu = nearby(self._problem.parameters, self._mus[number], self._seed, number, *seed)
+        mu = self._next_to(number, *seed)
         return MarginalSolution(number, *timed(partial(checked_assembly, self._problem, mu)), None)
+
+    def _next_to(self, number: int, *seed: int) -> Array:
+        return nearby(self._problem.parameters, self._mus[number], self._seed, number, *seed)
 
 
 class MarginalSolution(NamedTuple):

@@ -137,6 +137,7 @@ def right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         "greedy_cone.snapshots": np.eye(3, 4), "Snapshots.u": np.eye(5, 4), "Snapshots.lam": np.eye(3, 4),
         "solve_qp.start": None, "Offline.generators": size,
         "HighFidelitySolver.condensed.vi": assembled, "HighFidelitySolver.solve_assembled.vi": assembled,
+        "HighFidelitySolver.solve_from.vi": assembled, "HighFidelitySolver.solve_from.nearest": None,
         "HighFidelitySolver.solve_next.vi": assembled, "HighFidelitySolver.verify.vi": assembled,
         "Blocks.gap.error": two_rows, "Blocks.gap.unit": 0.0, "Output.values.mus": np.ones((2, 1)),
         "Output.values.u": np.ones((5, 2)), "Output.values.lam": np.ones((3, 2)),

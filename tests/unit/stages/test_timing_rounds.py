@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from samples import SampleStore, mixed_cell, store_of
 
 from vibench import MEMBERS, NumericalError, QPSolution, Status, Stop, VariationalInequality, solve_qp
+from vibench.highfidelity import active_set
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.plugins import registry
@@ -130,13 +131,18 @@ def test_high_fidelity_solutions_start_as_in_the_sweep(store: SampleStore, monke
     stage = TimingRounds(CELLS, (EVERY,) * len(CELLS), 1, 0)
     reference = gather(store, stage.cells[0].validation)
     starts: list[Any] = []
-    solve = marginal_solutions.solve_unverified
-    monkeypatch.setattr(marginal_solutions, "solve_unverified", lambda *a: (starts.append(a[2]), solve(*a))[1])
+    solve = active_set.solve_unverified
+    monkeypatch.setattr(active_set, "solve_unverified", lambda *a: (starts.append(a[2]), solve(*a))[1])
     marginal = MarginalSolutions(PROBLEM.create(), reference, 1)
     assert all(one.seconds and one.seconds.cpu > one.assembly.cpu for one in (marginal.solve(k, 0) for k in EVERY))
     sources = [[1], [0], [2], [3], [5], [4]]  # in parts of two, one, one and two
     for start, numbers in zip(starts, sources, strict=True):
         assert any(np.array_equal(start, reference.lam[:, number] > 0.0) for number in numbers)
+    # A problem may derive another start, as the American put does.
+    own = np.zeros(len(reference.lam), bool)
+    monkeypatch.setattr(type(marginal._problem), "start", lambda *_: own)
+    assert marginal.solve(0, 1).seconds
+    assert starts[-1] is own
     wrong = replace(reference, u=reference.u[:, ::-1].copy())
     assert MarginalSolutions(PROBLEM.create(), wrong, 1).solve(0, 0).seconds is None
 
