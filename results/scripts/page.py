@@ -26,6 +26,7 @@ LIMITATIONS = {
     "paper-hertz": f"{ONE_MACHINE} Quadrature and master mesh of the paper are not published; N and R depend on them (page hertz-quadrature). Full assembly does not make use of A being constant.",  # noqa: E501
     "benefit": f"{ONE_MACHINE} One cone (mCPG), two pairs of dimensions and one solver for each problem. Gains are those of models with different errors: compare rows with equal errors.",  # noqa: E501
     "field": f"{ONE_MACHINE} One mesh of medium size for each problem, one solver, 32 validation parameters. Strategies of others are our implementations, with their default options.",  # noqa: E501
+    "enriching": f"{ONE_MACHINE} Three problems, two cones and one enrichment. The pack has one mesh, and PIQP solves all programs.",  # noqa: E501
     "certified": f"{ONE_MACHINE} One cone (mCPG) in `certified`. Effectivities are those at 64 parameters; bounds of the obstacle rely on interpolation errors that were measured at other parameters. Greedy training chooses among bounds that are nearly equal: on another processor, with other round-off, it may choose others.",  # noqa: E501
     "calibrations": f"{ONE_MACHINE} It was busy: seconds are to be compared within a row. One tolerance of the cone.",
     "formulations": f"{ONE_MACHINE} Formulations are our implementations of published methods on assembled operators, with their default options and one accuracy; methods of their authors may differ in what they integrate and solve.",  # noqa: E501

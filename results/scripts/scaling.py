@@ -124,7 +124,8 @@ def all_rows() -> Iterator[dict[str, Any]]:
     name, meshes = FACTORISED
     case = CASES[name]
     for one in IMPLEMENTATIONS.values():
-        for nodes in meshes if one.is_installed else ():
+        # Multigrid is for scalar fields.
+        for nodes in meshes if one.is_installed and not one.is_iterative else ():
             yield from _in_a_process("factorisation", name, nodes, case.R, case.delta, case.N, one.name)
 
 

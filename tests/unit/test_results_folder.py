@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
@@ -124,6 +125,26 @@ def test_the_tables_of_readme_and_conclusions_are_those_of_committed_cells() -> 
                 mine = [row for row in mine if float(row[one]) <= 1.5 * float(mixed[one])]
             near = [1e3 * float(row["online_s"]) for row in mine]
             assert shown == "–" if not near else float(shown) == pytest.approx(min(near), rel=0.06)
+
+
+def test_the_rule_for_enriching_is_that_of_committed_cells_on_five_problems() -> None:
+    """Recomputed without the scripts: every enriched model beside the same cone and modes without enrichment."""
+    text = (ROOT / "docs" / "what-to-use.md").read_text(encoding="utf-8").split("## Which cone?")[0]
+    factors: dict[tuple[str, bool], list[float]] = {}
+    for study, how in (("paper-obstacle", "full"), ("paper-hertz", "full"), ("enriching", "reduced")):
+        plain, same = {}, ("problem", "dual", "pod_tol", "pod_size", "dual_tol", "dual_size")
+        for row in sorted(rows_of(study, assembly=how, solver="piqp"), key=lambda row: row["primal"] != "decorrelated"):
+            if row["primal"] == "decorrelated":
+                plain[tuple(row[name] for name in same)] = row
+            elif row["error_lambda_mean"]:
+                bare = plain[tuple(row[name] for name in same)]
+                few = factors.setdefault((row["problem"], int(bare["N"]) < int(bare["R"])), [])
+                few.append(float(bare["error_lambda_mean"]) / float(row["error_lambda_mean"]))
+    for (problem, few), mine in factors.items():
+        (shown,) = re.findall(rf"^\| (?:<!-- \w+ \d -->)?{problem} \| (.+?) \| (.+?)(?:<!-- -->)? \|$", text, re.M)
+        expected = np.median(mine), min(mine), max(mine), len(mine)
+        found = [float(number) for number in re.findall(r"[\d.]+(?:e[+-]\d+)?", shown[0 if few else 1])]
+        assert found == pytest.approx(expected, rel=0.06), (problem, few)
 
 
 def test_sentences_are_made_from_the_tables(monkeypatch: pytest.MonkeyPatch) -> None:
