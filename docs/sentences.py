@@ -574,7 +574,8 @@ def when_not() -> Sequence[str]:
     """From how many queries models pay, by problem and assembly, and regression beside them."""
     rows, studies = [], ("benefit", "paper-obstacle", "paper-hertz")
     tables = [pd.read_csv(ROOT / "results" / study / "thresholds.csv") for study in studies]
-    every = pd.concat([table[table["cell_a"].isna() & (table["solver"] == "piqp")] for table in tables])
+    # C programs are solved by no solver.
+    every = pd.concat([table[table["cell_a"].isna() & table["solver"].isin(["piqp", "–"])] for table in tables])
     for (problem, how), mine in every.groupby(["problem", "assembly_b"]):
         begins = mine["benefit_threshold"][mine["meaning"] == "from"]
         if len(begins):

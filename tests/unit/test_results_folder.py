@@ -127,6 +127,12 @@ def test_the_tables_of_readme_and_conclusions_are_those_of_committed_cells() -> 
             assert shown == "–" if not near else float(shown) == pytest.approx(min(near), rel=0.06)
 
 
+def test_no_assembly_of_a_study_is_left_out_of_when_models_pay() -> None:
+    text = (ROOT / "docs" / "what-to-use.md").read_text(encoding="utf-8").split("## When should I not reduce")[1]
+    shown = set(re.findall(r"^\| (?:<!-- \w+ \d -->)?([\w-]+) \| (\w+) \|", text, re.M))
+    assert {(row["problem"], row["assembly"]) for row in rows_of("benefit")} <= shown
+
+
 def test_the_rule_for_enriching_is_that_of_committed_cells_on_five_problems() -> None:
     """Recomputed without the scripts: every enriched model beside the same cone and modes without enrichment."""
     text = (ROOT / "docs" / "what-to-use.md").read_text(encoding="utf-8").split("## Which cone?")[0]
