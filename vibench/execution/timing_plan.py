@@ -92,8 +92,8 @@ class _Group:
         self.rounds: dict[str, list[TimedRound]] = defaultdict(list)
         self.machines: dict[str, set[str]] = defaultdict(set)
         self.failures: dict[str, list[Failed]] = defaultdict(list)
-        # Numbers of the next block and of the next round.
-        self.blocks = self.first = 0
+        # Numbers of the next block and of the next round, and the session of the last block.
+        self.blocks = self.first = self.session = 0
         # CPU seconds of a round of one cell, in the last block.
         self.seconds = 0.0
         # The comparisons that the minimal rounds and later blocks have left undecided, `None` before.
@@ -173,8 +173,8 @@ class TimingPlan:
             if len(blocks) < count and cost <= left:
                 left -= cost
                 self._held.remove(held)
-                # A session of its own: any process may have timed this group before.
-                blocks.append(self._block(group, self._session + 1, goals))
+                # Processes of this session may have timed the group before; those of the next one have not.
+                blocks.append(self._block(group, self._session + (group.session == self._session), goals))
         return blocks
 
     def _block(self, group: _Group, session: int, goals: Iterable[CellQueries]) -> TimingRounds:
@@ -183,7 +183,7 @@ class TimingPlan:
         rounds = block_sizes(self._rounds)[group.blocks]
         stage = TimingRounds(mine, tuple(group.queries[goal.key] for goal in mine), rounds, group.first, session)
         self._planned[stage.key] = group
-        self._session = max(self._session, session)
+        self._session, group.session = max(self._session, session), session
         return stage
 
     def record(self, stage: Stage, outcome: tuple[TimedCell, ...] | Failed) -> TimingRounds | None:
