@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import published
 
-from vibench import Array, CompiledModel, CompiledProgram, Problem, Reduction, Stop, UnsupportedError, solve_qp
+from vibench import Array, CompiledModel, CompiledProgram, Problem, Reduction, Stop, UnsupportedError
 from vibench.qp import kkt_residuals
+from vibench.qp.solve import solve_qp
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
@@ -139,6 +140,7 @@ class Ours(Side):
 
     def query(self, way: str, mu: Array, accuracy: float, solver: str = "daqp") -> published.Answer:
         """The answer at mu (d,) of the same spaces, in reduced assembly."""
+        # As queries of a study do: the public `solve_qp` checks what users pass, which takes a fifth of a query.
         reduced = (self.per_parameter if way == "online" else self.fixed).assembled.assemble(mu)
         found = solve_qp(reduced.program, solver, accuracy, factor=reduced.factor)
         return reduced.program, found.x, found.alpha, lambda: reduced.basis
