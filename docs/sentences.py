@@ -21,15 +21,14 @@ BARE, ONLINE, OFFLINE = "decorrelated", "online-supremizers", "offline-pga"
 PLACE = re.compile(r"<!-- (\w+) (\d+) -->.*?<!-- -->", re.DOTALL)
 
 
-def every_formulation() -> pd.DataFrame:
-    """The cells of the study of formulations, those without a solver included."""
-    return pd.read_csv(ROOT / "results" / "formulations" / "cells.csv")
+def result(page: str, table: str = "cells") -> pd.DataFrame:
+    """A table of a page of results."""
+    return pd.read_csv(ROOT / "results" / page / f"{table}.csv")
 
 
 def cells(study: str) -> pd.DataFrame:
     """The cells of a study, with the solver of the pages."""
-    table = pd.read_csv(ROOT / "results" / study / "cells.csv")
-    return table[table["solver"] == "piqp"]
+    return result(study)[lambda table: table["solver"] == "piqp"]
 
 
 def cones() -> Sequence[str]:
@@ -178,7 +177,7 @@ def enrichments() -> Sequence[str]:
     mine = tight(table)[lambda rows: rows["dual"] == "mcpg"].set_index(["problem", "primal", "primal_tol"])
     hertz, obstacle = mine.loc["hertz"], mine.loc["obstacle"]
     assert hertz["offline_enrichment_s"].idxmax()[0] == "pod-supremizers"
-    (numbers,) = [one for one in page_tables("field") if "infsup-greedy" in one and "pod_tol" in one]
+    numbers = result("field", "vectors")
     numbers = numbers[(numbers["problem"] == "hertz") & (numbers["pod_tol"] == 1e-3)]
     ways = ("infsup-greedy", "offline-pga", "offline-pga (stop on β)", "pod-supremizers")
     for row in numbers.to_dict("records"):  # a share of 0.3, 0.5, 0.7 and 0.9
@@ -220,7 +219,7 @@ def formulation_name(name: str) -> str:
 
 def formulations() -> Sequence[str]:
     """What it says of formulations: times and errors beside those of `mixed`, and less training."""
-    table = every_formulation()
+    table = result("formulations")
     assert (table["queries_ok"] == table["queries"]).all()
     key = ["problem", "dual", "pod_tol", "training"]
     mixed = table[table["formulation"] == "mixed"].set_index(key)
@@ -247,12 +246,11 @@ def formulations() -> Sequence[str]:
     grown = np.log(errors_of[["half", "inner"]].div(errors_of["own"], axis=0))
     growth = np.exp(grown.groupby(level=["formulation", "problem"]).mean()).reset_index("problem", drop=True)
     kinds, told = growth.groupby(growth.index.str.split().str[0]), ("mixed", "local", "regression")
-    meaning = pd.read_csv(ROOT / "results" / "formulations" / "thresholds.csv").groupby("formulation_b")["meaning"]
+    meaning = result("formulations", "thresholds").groupby("formulation_b")["meaning"]
     assert set(meaning.get_group("regression (radial)")) == {"at once"}
     assert set(meaning.get_group("proximal")) == {"never"}
-    levels, *_ = page_tables("formulations")
-    (compiled,) = [table for table in page_tables("formulations") if "query / compiled" in table]
-    best = levels.groupby("problem").last()
+    compiled = result("formulations", "compiled")
+    best = result("formulations", "levels").groupby("problem").last()
     problems = {"obstacle": "obstacle", "hertz": "Hertz", "bearing": "bearing", "american-put": "American put"}
     return (
         table_rows(
@@ -272,21 +270,11 @@ def formulations() -> Sequence[str]:
     )
 
 
-def page_tables(study: str) -> list[pd.DataFrame]:
-    """The Markdown tables of a page of results, in their order."""
-    text = (ROOT / "results" / study / "README.md").read_text(encoding="utf-8")
-    found = []
-    for part in re.findall(r"^\|.*(?:\n\|.*)*", text, re.MULTILINE):
-        head, _, *rows = [[word.strip() for word in line.strip("|").split("|")] for line in part.splitlines()]
-        table = pd.DataFrame(rows, columns=head)
-        numeric = [name for name in head if table[name].str.fullmatch(r"-?[\d.]+(e[+-]\d+)?").all()]
-        found.append(table.assign(**{name: pd.to_numeric(table[name]) for name in numeric}))
-    return found
-
-
 def certified() -> Sequence[str]:
     """What it says of certified models: effectivities, corrections, certificates and greedy training."""
-    medians, largest, costs, corrected, *_ = page_tables("certified")
+    medians, largest, costs, corrected = (
+        result("certified", name) for name in ("medians", "effectivities", "costs", "corrections")
+    )
     norms = ("u in the energy norm", "u in V", "λ in the natural norm", "λ in W")
     kinds = {"(ii)": "with the best correction", "(ii) online": "at online cost",
              "HSW": "Haasdonk, Salomon and Wohlmuth"}  # fmt: skip
@@ -304,7 +292,7 @@ def certified() -> Sequence[str]:
     gains = ["λ without / with online", "λ without / with in full"]
     of_obstacle = corrected[corrected["problem"] == "obstacle"]
     least = of_obstacle[["error λ", "error λ online"]].min()
-    training = pd.read_csv(ROOT / "results" / "certified" / "training.csv")
+    training = result("certified", "training")
     equal = training[training["largest ratio of errors"] <= 1.0]
     missed = training[training["largest ratio of errors"] > 1.0]
     assert set(missed["paper"]) == {"no"}
@@ -317,7 +305,7 @@ def certified() -> Sequence[str]:
         table_rows(effectivities),
         table_rows([name, *(takes[how, name.lower()] for how in ("own", "greedy"))] for name in ("obstacle", "Hertz")),
         *(
-            f"| {100.0 * rows['ω &gt; ρ online'].min():.0f} to {100.0 * rows['ω &gt; ρ online'].max():.0f} % | "
+            f"| {100.0 * rows['ω > ρ online'].min():.0f} to {100.0 * rows['ω > ρ online'].max():.0f} % | "
             f"{' | '.join(f'{rows[name].min():.3g} to {rows[name].max():.3g}' for name in gains)} |"
             for rows in (of_obstacle, corrected[corrected["problem"] == "hertz"])
         ),
@@ -329,7 +317,7 @@ def certified() -> Sequence[str]:
 
 def unseen_parameters() -> Sequence[str]:
     """What it says of random parameters that no training set has."""
-    table = pd.read_csv(ROOT / "results" / "certified" / "unseen.csv")
+    table = result("certified", "unseen")
     assert (table["violations"] == 0).all()
     assert (table["without a bound"] == 0).all()
     effectivities = []
@@ -370,16 +358,16 @@ def of_models(rows: pd.DataFrame) -> dict[str, str]:
     }
 
 
-def of_costs(rows: pd.DataFrame, page: str) -> dict[str, str]:
-    """What it says of seconds and bounds of the models on one mesh; break-even is that of the page."""
+def of_costs(rows: pd.DataFrame, pairs: pd.DataFrame) -> dict[str, str]:
+    """What it says of seconds and bounds of the models on one mesh, and of their break-even."""
     kinds = {kind: rows[rows["assembly"] == kind] for kind in ("reduced", "certified")}
-    certified, label = kinds["certified"], str(rows["problem"].iloc[0])
-    pattern = rf"\| {label} +\|[^|]+\|[^|]+\| high-fidelity +\|[^|]+\| (reduced|certified) +\|[^|]+\| from (\d+)"
-    starts = {kind: [int(start) for found, start in re.findall(pattern, page) if found == kind] for kind in kinds}
+    certified = kinds["certified"]
+    mine = pairs[(pairs["problem"] == rows["problem"].iloc[0]) & (pairs["in place of"] == "high-fidelity")]
+    from_on = mine["pays, in queries"].str.removeprefix("from ").astype(int).groupby(mine["assembly"])
     each = {
         kind: {
             f"{kind} query [ms]": span(1e3 * some["online_s"]),
-            f"{kind}: pays from, queries": f"{min(starts[kind])} to {max(starts[kind])}",
+            f"{kind}: pays from, queries": f"{from_on.min()[kind]} to {from_on.max()[kind]}",
         }
         for kind, some in kinds.items()
     }
@@ -394,22 +382,18 @@ def of_costs(rows: pd.DataFrame, page: str) -> dict[str, str]:
 
 def elliptic_contact() -> Sequence[str]:
     """What the gallery says of differences from Hertz's contact."""
-    page = (ROOT / "results" / "three-dimensions" / "README.md").read_text(encoding="utf-8")
-    lines = [line.strip("| ").split("|") for line in re.findall(r"^\| (?:coarse|medium|paper|fine) .*$", page, re.M)]
-    names = ["mesh", "n", "m", "mu", "force", "flat", "peak", "a", "b", "in contact", "active sets", "seconds"]
-    table = pd.DataFrame([dict(zip(names, map(str.strip, line), strict=False)) for line in lines])
-    table = table.astype(dict.fromkeys(["n", "m", *names[4:]], float))
+    table = result("three-dimensions", "theory")
     table["axes"] = table[["a", "b"]].abs().max(axis=1)
-    largest = table.groupby("n").agg(dict.fromkeys(["force", "peak", "axes"], lambda each: each.abs().max()))
+    largest = table.groupby("unknowns").agg(dict.fromkeys(["force", "peak", "axes"], lambda each: each.abs().max()))
     assert (largest[largest.index > 20_000] < [0.02, 0.01, 0.01]).all(axis=None)
-    rows = table.groupby("n")[["mesh", "m"]].first().join(largest)
-    seconds = table.groupby("n")["seconds"].median()
+    rows = table.groupby("unknowns")[["mesh", "multipliers"]].first().join(largest)
+    seconds = table.groupby("unknowns")["seconds"].median()
     return (
         table_rows(
             [
                 f"`{one['mesh']}`",
                 f"{n:,.0f}",
-                f"{one['m']:.0f}",
+                f"{one['multipliers']:.0f}",
                 *(f"{100.0 * one[of]:.3g} %" for of in largest),
                 f"{seconds[n]:.2g}",
             ]
@@ -420,15 +404,15 @@ def elliptic_contact() -> Sequence[str]:
 
 def space() -> Sequence[str]:
     """What it says of contact in space, by mesh and beside the plane."""
-    table = pd.read_csv(ROOT / "results" / "three-dimensions" / "cells.csv")
+    table = result("three-dimensions")
     assert (table["queries_ok"] == table["queries"]).all()
     assert (table["bound_online_violations"].fillna(0.0) == 0.0).all()
     assert (table.loc[table["primal"] == BARE, "beta_span_min"] == 0.0).all()
-    page = (ROOT / "results" / "three-dimensions" / "README.md").read_text(encoding="utf-8")
+    pairs = result("three-dimensions", "break-even")
     plane = cells("paper-hertz")
     plane = plane[(plane["primal_tol"].isna() | (plane["primal_tol"] == 0.5)) & (plane["assembly"] == "full")]
     meshes = [rows for _, rows in sorted(table.groupby("dim_V"), key=lambda one: one[0])]
-    columns = [of_models(rows[rows["assembly"] == "reduced"]) | of_costs(rows, page) for rows in meshes]
+    columns = [of_models(rows[rows["assembly"] == "reduced"]) | of_costs(rows, pairs) for rows in meshes]
     columns.append(of_models(plane))
     for rows, smaller in ((table, True), (plane, False)):  # than the number of generators
         added = rows[(rows["primal"] == OFFLINE) & (rows["dual"] == "mcpg") & (rows["pod_tol"] == rows["dual_tol"])]
@@ -439,7 +423,6 @@ def space() -> Sequence[str]:
         sized.loc[sized["dim_V"] == edge, "online_s"] for edge in (table["dim_V"].max(), table["dim_V"].min())
     )
     ratios = (finer / coarser).dropna()
-    (pairs,) = [one for one in page_tables("three-dimensions") if "pays, in queries" in one]
     pays = pairs[pairs["in place of"] == ONLINE].groupby("assembly")["pays, in queries"].value_counts()
     assert pays["reduced"].to_dict() == {"at once": len(meshes) * 4}
     assert set(pays["certified"].index) == {"undecided", "as fast"}
@@ -511,7 +494,7 @@ def chosen_cone() -> Sequence[str]:
 
 def chosen_solver() -> Sequence[str]:
     """Every QP solver: seconds relative to the fastest one of a model, and models that it solves."""
-    table = pd.read_csv(ROOT / "results" / "solvers" / "cells.csv")
+    table = result("solvers")
     least = table.groupby([*MODEL, "accuracy"], dropna=False)["online_solve_s"].transform("min")
     table = table.assign(ratio=(table["online_solve_s"] / least).where(table["status"] == "ok"))
     rows = []
@@ -538,7 +521,7 @@ def chosen_assembly() -> Sequence[str]:
 
 def chosen_formulation() -> Sequence[str]:
     """All formulations at equal error and at equal cost, on four problems."""
-    table = every_formulation()
+    table = result("formulations")
     own, fastest, exact = table[table["training"] == "own"], [], []
     for name in dict.fromkeys(["mixed", *sorted(own["formulation"].unique())]):
         word, _, kind = name.partition(" ")
@@ -562,7 +545,7 @@ def chosen_formulation() -> Sequence[str]:
 
 def chosen_training() -> Sequence[str]:
     """Greedy training against fixed training where no error is larger."""
-    table = pd.read_csv(ROOT / "results" / "certified" / "training.csv")
+    table = result("certified", "training")
     rows = []
     for problem, mine in table[table["largest ratio of errors"] <= 1.0].groupby("problem"):
         solutions = float((mine["greedy snapshots"] / mine["fixed snapshots"]).median())
@@ -573,14 +556,14 @@ def chosen_training() -> Sequence[str]:
 def when_not() -> Sequence[str]:
     """From how many queries models pay, by problem and assembly, and regression beside them."""
     rows, studies = [], ("benefit", "paper-obstacle", "paper-hertz")
-    tables = [pd.read_csv(ROOT / "results" / study / "thresholds.csv") for study in studies]
+    tables = [result(study, "thresholds") for study in studies]
     # C programs are solved by no solver.
     every = pd.concat([table[table["cell_a"].isna() & table["solver"].isin(["piqp", "–"])] for table in tables])
     for (problem, how), mine in every.groupby(["problem", "assembly_b"]):
         begins = mine["benefit_threshold"][mine["meaning"] == "from"]
         if len(begins):
             rows.append([problem, how, len(mine), pays(begins), int(mine["meaning"].isin(["never", "until"]).sum())])
-    table = every_formulation()
+    table = result("formulations")
     radial = table[(table["formulation"] == "regression (radial)") & (table["training"] == "own")]
     for problem, mine in radial.groupby("problem"):
         faster = mine[mine["online_s"] < mine["hf_s"]]
@@ -591,7 +574,7 @@ def when_not() -> Sequence[str]:
 def first_page() -> Sequence[str]:
     """The answer of README for the two problems of the paper: a table of models, and what holds beyond it."""
     names = ("obstacle", "hertz")
-    benefit, others = cells("benefit"), every_formulation()
+    benefit, others = cells("benefit"), result("formulations")
     own = others[(others["training"] == "own") & (others["dual"] == "mcpg") & (others["dual_tol"] == 1e-2)]
     # The models of the pair with more generators than modes on the obstacle, where enrichment decides.
     pair = benefit[(benefit["assembly"] == "reduced") & (benefit["dual_tol"] == 1e-2)]

@@ -36,24 +36,6 @@ STUDIES = "formulations", "formulations-compiled"
 KEY = ["problem", "formulation", "dual", "pod_tol"]
 
 
-def table(cells: pd.DataFrame) -> pd.DataFrame:
-    """Sizes, errors, violation and seconds of every cell with the problem's own training set."""
-    return pd.DataFrame(
-        {
-            **{name: cells[name].fillna("–") for name in KEY},
-            **{name: cells[name] for name in ("N", "enrichment", "R")},
-            "ok": cells["queries_ok"].astype(str) + "/" + cells["queries"].astype(str),
-            "error u": cells["error_u_mean"],
-            "error λ": cells["error_lambda_mean"],
-            "largest violation": cells["violation_max"],
-            "KKT residual": cells["hf_residual_max"],
-            "offline [s]": cells["offline_s"],
-            "query [ms]": 1e3 * cells["online_s"],
-            "reason": cells["reason"].fillna(""),
-        }
-    )
-
-
 def answered(cells: pd.DataFrame) -> pd.DataFrame:
     """Cells with every query ok, whose seconds were measured."""
     return cells[(cells["queries_ok"] == cells["queries"]) & cells["online_s"].notna()]
@@ -155,8 +137,8 @@ def figure(cells: pd.DataFrame) -> Figure:
             scatter(panel, 1e3 * mine["online_s"], mine["error_lambda_mean"], looks[Series(name)], name)
         panel.set(title=problem, xlabel="query [ms]", ylabel="mean relative error of λ", xscale="log", yscale="log")
     return sheet.finish(
-        f"{title}: one point per cell with every query ok and the problem's own training set, a colour and a marker "
-        "for every formulation; several points of one are those of cones and tolerances."
+        f"{title}: a point for every cell with all queries ok and the problem's own training set, a marker for every "
+        "formulation."
     )
 
 
@@ -183,7 +165,7 @@ def main(run: str, run_compiled: str, target: str) -> None:
     command = made_by("by_formulation", "formulations", *STUDIES, options=" --no-figures")
     page = Page(
         target,
-        "Formulations",
+        "Which formulation?",
         command,
         SECONDS,
         f"{len(cells)} cells, {len(answered(cells))} with every query ok, at {int(own['queries'].max())} parameters. "
@@ -191,40 +173,48 @@ def main(run: str, run_compiled: str, target: str) -> None:
         "relative means.",
         machine=origin(cells, exported),
     )
-    page.section("Error of λ at equal query time", winners(own, "error_lambda_mean"))
-    page.section("Error of u at equal query time", winners(own, "error_u_mean"))
+    levels = winners(own, "error_lambda_mean")
+    first, last = (levels.groupby("problem", sort=False).nth(k)["formulation"] for k in (0, -1))
+    assert first.str.startswith("regression").all()
+    above = violated(queries)
+    counts = [text.split(" of ") for name in BOUNDED for text in above[name]]
+    page.answer(
+        "On every problem `regression (radial)` is the fastest, at a larger error and without proof. Within "
+        f"{BUDGETS[-1]:g} times its seconds the smallest error of λ is that of "
+        f"{', '.join(f'`{name}`' for name in dict.fromkeys(last))}.",
+        levels[levels.groupby("problem").cumcount().isin((0, len(BUDGETS) - 1))],
+    )
     with styled():
         page.draw("formulations-time", figure(own))
-    page.section("All cells", table(own))
     compared = pairs(read(run, "thresholds"))
-    page.section(
-        "Break-even with `mixed`",
-        "The number of queries from which, or until which, a formulation is cheaper in total than `mixed` with the "
-        "same cone and tolerances, whatever their errors, with its 95 % interval: columns are the cone and δ_POD.",
+    page.file("levels", "the smallest error of λ within multiples of the fastest query", levels)
+    page.file("levels-u", "the same of u", winners(own, "error_u_mean"))
+    page.file(
+        "break-even",
+        "from, or until, how many queries a formulation is cheaper in total than `mixed` with the same cone and "
+        "tolerances, whatever their errors, with its 95 % interval",
         break_evens(compared),
     )
-    page.section(
-        "Compiled",
-        "The cells of `mixed` with `mcpg` as programs in C, from a run of their own. No other formulation is exported.",
-        compiled(exported),
-    )
-    page.section(
-        "Half of the training set, and outside of it",
-        "Factors of the mean errors against those with the own training set: with half as many solutions (`half`), and "
-        "with solutions of the inner 70 per cent of the box alone (`inner`), at parameters of the whole box.",
+    page.file("compiled", "cells of `mixed` with `mcpg` as programs in C, from a run of their own", compiled(exported))
+    page.file(
+        "training",
+        "factors of mean errors against those with the own training set: with half of it (`half`), and with the inner "
+        "70 per cent of the box alone (`inner`)",
         robustness(cells),
     )
-    page.section("Bounds", "Errors above their bounds, of those compared.", violated(queries))
-    page.section(
-        "Uncertainty that formulations state",
-        "The bound of u is of the sum with λ, so that it is large beside the error of u where the error of λ is "
-        "larger: `regression` has no enrichment.",
+    page.file(
+        "bounds",
+        f"errors above their bounds, by norm, in all {sum(int(one) for one, _ in counts)} of "
+        f"{sum(int(of) for _, of in counts):,}",
+        above,
+    )
+    page.file(
+        "uncertainty",
+        "what `regression` states of its error, and the bound, which is of the sum with λ and large where λ is wrong",
         uncertainty(queries),
     )
-    page.add(
-        f"All columns of the cells: {page.link('cells', cells.drop(columns=['definition', 'versions']))}; of the "
-        f"break-evens with `mixed`: {page.link('thresholds', compared)}."
-    )
+    page.file("cells", "every cell, with all columns", cells.drop(columns=["definition", "versions"]))
+    page.file("thresholds", "break-even with `mixed`, in numbers", compared)
     page.write()
 
 

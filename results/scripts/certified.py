@@ -37,6 +37,9 @@ NORMS = {
 }
 """Errors and their bounds, by what is measured and in which norm."""
 
+DRAWN = ("u in the energy norm", "λ in the natural norm")
+"""Norms of the picture."""
+
 
 def effectivities(cells: pd.DataFrame, queries: pd.DataFrame, of: str) -> pd.DataFrame:
     """Effectivities over the ok queries of every certified model, "median" or "max", and the number of violations."""
@@ -140,10 +143,11 @@ def figure(cells: pd.DataFrame, queries: pd.DataFrame) -> Figure:
     """Bounds against errors of all certified queries, a row of panels for every norm; equal on the grey line."""
     certified = cells[(cells["assembly"] == CERTIFIED) & (cells["correction"] == CorrectionMode.NONE)]
     problems = list(certified["problem"].unique())
-    sheet = Sheet(len(NORMS), len(problems), "bounds against errors, all queries of certified models")
+    sheet = Sheet(len(DRAWN), len(problems), "bounds against errors, all queries of certified models")
     for column, problem in enumerate(problems):
         mine = queries[queries["cell"].isin(certified.loc[certified["problem"] == problem, "cell"])]
-        for row, (norm, (error, bounds)) in enumerate(NORMS.items()):
+        for row, norm in enumerate(DRAWN):
+            error, bounds = NORMS[norm]
             panel, errors = sheet.panel(row, column), mine[error]
             for name, bound in bounds.items():
                 scatter(panel, errors, mine[f"bound_{bound}"], look_of(name), name, markersize=3)
@@ -152,65 +156,65 @@ def figure(cells: pd.DataFrame, queries: pd.DataFrame) -> Figure:
             panel.set(xscale="log", yscale="log", xlabel=f"error of {norm}", ylabel="bound", title=problem)
     count = f"{len(queries[queries['cell'].isin(certified['cell'])])} queries of {len(certified)} certified models"
     return sheet.finish(
-        f"Bounds against the errors that they bound, in the {count}: of u in V and in the energy norm, of λ in W and "
-        "in the natural norm, one norm in each panel. HSW are the bounds of Haasdonk, Salomon and Wohlmuth, (ii) those "
-        "with the best correction, at high-fidelity and at online cost. On the grey line bound and error are equal: no "
-        "point may lie below it."
+        f"Bounds (ii) against the errors that they bound, in the {count}, at high-fidelity and at online cost. On "
+        "the grey line bound and error are equal: no point may lie below it."
     )
-
-
-HEADINGS = {"primal_tol": "δ", "pod_tol": "δ_POD", "dual_tol": "δ_dual"}
 
 
 def main(certified: str, training: str, target: str) -> None:
     cells, queries, trained = read(certified, "cells"), read(certified, "queries"), read(training, "cells")
     trained["query [ms]"] = 1e3 * trained["online_s"]
-    equal = equal_errors(trained)
     page = Page(
         target,
-        "certified",
+        "What do bounds cost, and how sharp are they?",
         made_by("certified", "certified", "certified", "training", options=" --no-figures"),
         SECONDS,
         machine=origin(cells, trained),
     )
-    page.section(
-        "Effectivities",
-        "Bound over error, over the ok queries of every model: first the medians, then the largest. HSW are the bounds "
-        "of Haasdonk, Salomon and Wohlmuth, (ii) those with the best correction, at high-fidelity cost and online.",
-        effectivities(cells, queries, "median").rename(columns=HEADINGS),
-        effectivities(cells, queries, "max").rename(columns=HEADINGS),
+    medians, largest, costly = (
+        effectivities(cells, queries, "median"), effectivities(cells, queries, "max"), costs(cells),
+    )  # fmt: skip
+    equal = equal_errors(trained)
+    ratios = equal["greedy offline_s"] / equal["fixed offline_s"]
+    ratios = ratios[equal["largest ratio of errors"] <= 1.0].groupby(equal["problem"])
+    of_u, of_lam = (medians[f"{norm}, (ii) online"] for norm in ("u in the energy norm", "λ in the natural norm"))
+    share = (costly["certificate / query without"].groupby(costly["problem"])).median()
+    page.answer(
+        f"None of the {int(medians['queries'].sum()):,} pairs of bounds at online cost is violated; their median is "
+        f"{of_u.median():.2g} times the error of u and {of_lam.median():.2g} times the error of λ. A certificate takes "
+        f"{' and '.join(f'{each:.2g} times the seconds of a query on {name}' for name, each in share.items())}. "
+        "Greedy training of equal errors takes the offline seconds of a fixed set "
+        f"{' and '.join(f'{each:.2g} times on {name}' for name, each in ratios.median().items())}.",
     )
+    assert not medians["violations"].any()
     with styled():
         page.draw("bounds", figure(cells, queries))
-    page.section("Cost of a certificate", costs(cells).rename(columns=HEADINGS))
-    page.section(
-        "Corrected solutions",
-        "Relative mean errors and seconds of a query with its certificate and correction: of the reduced solution, of "
-        "the pair corrected at online cost, and of that corrected at high-fidelity cost. Medians of the ratios of "
-        "errors of λ in W, and the share of queries with ω > ρ.",
-        corrections(cells, queries).rename(columns=HEADINGS),
-        "The fastest model at every level of the mean error of λ:",
-        cheapest(cells).rename(columns=HEADINGS),
+    page.file("medians", "median effectivities by model and norm; HSW: Haasdonk, Salomon and Wohlmuth", medians)
+    page.file("effectivities", "the largest ones", largest)
+    page.file("costs", "seconds of a query with its certificate and without, and of what is prepared offline", costly)
+    page.file(
+        "corrections",
+        "errors and seconds uncorrected, corrected at online cost and at high-fidelity cost; medians of the ratios of "
+        "errors of λ in W, and the share of queries with ω > ρ",
+        corrections(cells, queries),
     )
-    page.section(
-        "Greedy against fixed training",
-        "The study `training`: relative errors over the validation set, reduced assembly.",
-        trainings(trained).rename(columns=HEADINGS),
-        "At equal error: every mCPG model of a fixed set beside the smallest greedy model, of either cone, whose four "
-        "errors are at most its own, or, with a ratio above one, the one that comes closest. The column `paper` says "
-        "whether Niakh et al. (2022) use these tolerances for the problem.",
-        equal.drop(columns=[f"{way} {end}" for way in ("fixed", "greedy") for end in INTERVAL]).rename(
-            columns=HEADINGS
-        ),
+    page.file("fastest", "the fastest model at every level of the mean error of λ", cheapest(cells))
+    page.file(
+        "trainings", "greedy and fixed training sets over the validation set, reduced assembly", trainings(trained)
     )
-    linked = {"effectivities": effectivities(cells, queries, "max"), "training": equal}
-    page.add(f"Largest effectivities, and models of equal error: {', '.join(map(page.link, linked, linked.values()))}.")
-    page.add(
-        "Effectivities, violations and corrections at random parameters: [unseen.csv](unseen.csv), by "
-        "`python tests/benchmarks/certified.py runs/certified --table results/certified/unseen.csv`."
+    page.file(
+        "training",
+        "every mCPG model of a fixed set beside the smallest greedy one whose four errors are at most its own, or that "
+        "comes closest; `paper` says whether the paper uses these tolerances",
+        equal,
+    )
+    page.also(
+        "[unseen.csv](unseen.csv)",
+        "effectivities, violations and corrections at random parameters, by "
+        "`python tests/benchmarks/certified.py runs/certified --table results/certified/unseen.csv`",
     )
     failed = pd.concat(frame[frame["status"] != "ok"] for frame in (cells, trained))
-    page.add(*(f"- {row.cell}: {row.status}, {row.reason}" for row in failed.itertuples()))
+    page.file("not-ok", "cells that are not ok, and why", failed[["cell", *MODEL, "status", "reason"]])
     page.write()
 
 

@@ -1,4 +1,4 @@
-"""Results of the study `field`: tables, figures, and the Pareto fronts of error against dimension and time.
+"""Results of the study `field`: the Pareto front of error against time, cones, enrichments.
 
 vibench run field --no-figures && python results/scripts/field.py runs/field results/field
 
@@ -130,21 +130,15 @@ def front(cells: pd.DataFrame, cost: pd.Series, error: str) -> pd.DataFrame:
 
 
 def fronts(field: Field) -> pd.DataFrame:
-    """Pareto fronts of the error of λ against dimension and against the milliseconds of a reduced query."""
+    """Pareto fronts of the error of λ against the milliseconds of a reduced query."""
     rows = []
     reduced = field.cells[field.cells["assembly"] == "reduced"]
     for problem, cells in reduced.groupby("problem", sort=False):
-        costs = {"N + S + R": _dimension(cells), "query [ms]": 1e3 * cells["online_s"]}
-        for measure, cost in costs.items():
-            for _, cell in front(cells, cost, "error_lambda_mean").iterrows():
-                strategies = {"dual": cell["dual"], "primal": label(cell["primal"], cell["primal_tol"])}
-                errors = {"error u": cell["error_u_mean"], "error λ": cell["error_lambda_mean"]}
-                rows.append({"problem": problem, "cost": measure, "is": cell["cost"]} | strategies | errors)
+        for _, cell in front(cells, 1e3 * cells["online_s"], "error_lambda_mean").iterrows():
+            strategies = {"dual": cell["dual"], "primal": label(cell["primal"], cell["primal_tol"])}
+            errors = {"error u": cell["error_u_mean"], "error λ": cell["error_lambda_mean"]}
+            rows.append({"problem": problem, "query [ms]": cell["cost"]} | strategies | errors)
     return pd.DataFrame(rows)
-
-
-def _dimension(cells: pd.DataFrame) -> pd.Series:
-    return cells["N"] + cells["enrichment"].fillna(0) + cells["R"]
 
 
 def failures(field: Field) -> pd.DataFrame:
@@ -206,28 +200,23 @@ def scatter(field: Field, cost: Callable[[pd.DataFrame], pd.Series], xlabel: str
     )
 
 
-SECTIONS: dict[str, tuple[str, Callable[[Field], pd.DataFrame]]] = {
-    "Cones": (
-        "Errors with online supremizers, which reach the inf-sup constants of the whole of V. G is the Gram matrix of "
-        "the generators in W.",
+TABLES: dict[str, tuple[str, Callable[[Field], pd.DataFrame]]] = {
+    "cones": (
+        "sizes, conditioning of the Gram matrix G of the generators in W, and errors with online supremizers, which "
+        "reach the inf-sup constants of the whole of V",
         cones,
     ),
-    "Enrichments": (
-        f"Cone of {REFERENCE}, tighter tolerances. The share is the smallest of β_S(µ) / β_on(µ), both over the span, "
-        "on the training set; it is 1 where supremizers are added at every parameter.",
+    "enrichments": (
+        f"cone of {REFERENCE}, tighter tolerances; the share is the smallest of β_S(µ) / β_on(µ), both over the span, "
+        "on the training set, and 1 where supremizers are added at every parameter",
         primals,
     ),
-    "Vectors for a share of β_on": (
-        "Smallest numbers of vectors with which β_S(µ) at every training parameter reaches the shares "
-        f"{', '.join(map(str, SHARES))} of β_on(µ); a dash where no tolerance of the study reaches the share.",
+    "vectors": (
+        "smallest numbers of vectors with which β_S(µ) at every training parameter reaches the shares "
+        f"{', '.join(map(str, SHARES))} of β_on(µ); a dash where no tolerance of the study reaches the share",
         vectors,
     ),
-    "Pareto fronts of the error of λ": (
-        f"Cells with reduced assembly and every query ok that no other cell beats in both cost and error; {CONTROL} is "
-        "left out.",
-        fronts,
-    ),
-    "Cells that are not ok": ("", failures),
+    "not-ok": ("cells that are not ok, and why", failures),
 }
 
 
@@ -235,22 +224,27 @@ def main(run: str, target: str) -> None:
     field = Field.of(run)
     page = Page(
         target,
-        "Comparison of strategies",
+        "Which cone, and which enrichment?",
         made_by("field", "field", "field", options=" --no-figures"),
         SECONDS,
         f"{len(field.cells)} cells, {int((field.cells['status'] == 'ok').sum())} with every query ok. `vibench run "
         "field` leaves the tables of all queries and histories under `runs/field/tables`.",
         machine=origin(field.cells),
     )
+    best = fronts(field)
+    first, second, *_ = best["dual"].value_counts().index
+    page.answer(
+        f"{len(best)} models are beaten by no other one in both the error of λ and the seconds of a query. Most of "
+        f"them have the cones `{first}` and `{second}`; {int((best['primal'] != 'decorrelated').sum())} are enriched.",
+    )
+    title = "Error of λ against online time"
     with styled():
-        page.draw("field-shares", draw_shares(field))
-        title = "Error of λ against dimension"
-        page.draw("field-dimension", scatter(field, _dimension, "dimension N + S + R", title))
-        title = "Error of λ against online time"
         page.draw("field-time", scatter(field, lambda cells: 1e3 * cells["online_s"], "query, reduced [ms]", title))
-    for heading, (about, table) in SECTIONS.items():
-        page.section(heading, about, table(field))
-    page.add(f"All columns of the cells: {page.link('cells', field.cells.drop(columns=['definition', 'versions']))}.")
+        page.draw("field-shares", draw_shares(field))
+    page.file("fronts", f"these models; {CONTROL} is left out", best)
+    for name, (about, table) in TABLES.items():
+        page.file(name, about, table(field))
+    page.file("cells", "every cell, with all columns", field.cells.drop(columns=["definition", "versions"]))
     page.write()
 
 

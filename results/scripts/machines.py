@@ -15,32 +15,42 @@ from vibench.results.break_even import HIGH_FIDELITY
 
 BOTH = ["cell_a", "cell_b"]
 
+IDENTITY = [
+    "problem", "training", "formulation", "dual", "primal", "pod_tol", "pod_size", "dual_tol", "dual_size",
+    "primal_tol", "solver", "accuracy", "assembly", "correction",
+]  # fmt: skip
+"""What tells cells of a study apart; their keys depend on the version of vibench."""
+
 
 def main(results: str, target: str) -> None:
     page = Page(
         target,
-        "Other machines",
+        "Do conclusions hold on other machines?",
         "python results/scripts/machines.py results results/machines",
         "The tables of the other machine are those of the same commands there, with six digits; ours are on the pages "
-        "of the studies. Intervals of protocol 1 are those of one run, later ones include what differs between runs.",
+        "of the studies. Both machines decide a row where neither calls it undecided; it is contradicted where one is "
+        "cheaper on one machine and dearer on the other, or as fast on one with intervals of the gain that are apart. "
+        "Gains are those here over those there. Where the versions of the protocol differ, rows with the "
+        "high-fidelity model are left out: its seconds are not the same.",
     )
     folders = sorted(table.parent for table in Path(target).glob("*/*/cells.csv"))
-    pairs = {folder: (read(Path(results) / folder.name), read(folder)) for folder in folders}
-    page.section("What was compared", "\n".join(run(target, *pair) for pair in pairs.items()))
-    page.section(
-        "Break-even and gains",
-        pd.DataFrame([compared(folder, *pair) for folder, pair in pairs.items()]),
-        "Both machines decide a row where neither calls it undecided; it is contradicted where one is cheaper on one "
-        "machine and dearer on the other, or as fast on one with intervals of the gain that are apart. The number of "
-        "queries at break-even and the gain are ratios of seconds, and may be compared; seconds may not. Gains are "
-        "those here over those there: the median over the rows, and the smallest and the largest. Where the versions "
-        "of the protocol differ, rows with the high-fidelity model are left out: its seconds are not the same.",
+    pairs = {folder: (here := read(Path(results) / folder.name), as_here(read(folder), here[0])) for folder in folders}
+    gains = pd.DataFrame([compared(folder, *pair) for folder, pair in pairs.items()])
+    sizes = pd.DataFrame([numbers(folder, *pair) for folder, pair in pairs.items()])
+    page.answer(
+        f"{int(gains['contradicted'].sum())} of {int(gains['decided by both'].sum())} verdicts that both machines "
+        f"decide are contradicted. N, R and the number of vectors differ in {int(sizes['other sizes'].sum())} of "
+        f"{int(sizes['cells'].sum())} cells.",
+        gains,
     )
-    page.section(
-        "Numbers without seconds",
-        pd.DataFrame([numbers(folder, *pair) for folder, pair in pairs.items()]),
-        "Largest difference of a column over the cells that are ok on both machines, relative to its largest value.",
-    )
+    page.file("numbers", "largest difference of a column, over its largest value, of cells that are ok on both", sizes)
+    for folder, pair in pairs.items():
+        inside, (here, there) = folder.relative_to(target), (origin(cells) for cells, _ in pair)
+        page.also(
+            f"[{folder.name}](../{folder.name}/README.md)",
+            f"here {here.partition(',')[0]}, there `{folder.parent.name}`, {there.rpartition('vibench ')[2]} "
+            f"([cells]({inside}/cells.csv), [break-even]({inside}/thresholds.csv))",
+        )
     page.write()
 
 
@@ -54,13 +64,13 @@ def read(folder: Path) -> Tables:
     return cells, thresholds
 
 
-def run(target: str, folder: Path, both: tuple[Tables, Tables]) -> str:
-    """Where a study was run, here and there, with links to the tables of there."""
-    inside, (here, there) = folder.relative_to(target), (origin(cells) for cells, _ in both)
-    return (
-        f"- [{folder.name}](../{folder.name}/README.md): {here}; on `{folder.parent.name}`: {there} "
-        f"([cells]({inside}/cells.csv), [break-even]({inside}/thresholds.csv))"
-    )
+def as_here(there: Tables, cells: pd.DataFrame) -> Tables:
+    """Tables of another machine with the keys that their cells have among the `cells` of ours."""
+    both = there[0][[*IDENTITY, "cell"]].merge(cells[[*IDENTITY, "cell"]], on=IDENTITY, suffixes=("", "_here"))
+    ours = both.set_index("cell")["cell_here"]
+    assert len(ours) == len(there[0])
+    keys = {name: there[1][name].map(ours).where(there[1][name].notna()) for name in BOTH}
+    return there[0].assign(cell=there[0]["cell"].map(ours)), there[1].assign(**keys)
 
 
 def compared(folder: Path, here: Tables, there: Tables) -> dict[str, object]:
@@ -91,7 +101,10 @@ def numbers(folder: Path, here: Tables, there: Tables) -> dict[str, object]:
     both = here[0].merge(there[0], on="cell", suffixes=("", "_there"))
     both = both[(both["status"] == "ok") & (both["status_there"] == "ok")]
     row: dict[str, object] = {"study": folder.name, "machine": folder.parent.name, "cells": len(both)}
-    for column in ("N", "R", "enrichment", "beta_span_min", "error_u_mean", "error_lambda_mean"):
+    sizes = ["N", "R", "enrichment"]
+    apart = [both[name] != both[f"{name}_there"] for name in sizes]
+    row["other sizes"] = int(pd.concat(apart, axis=1).any(axis=1).sum())
+    for column in (*sizes, "beta_span_min", "error_u_mean", "error_lambda_mean"):
         ours, theirs = both[column], both[f"{column}_there"]
         row[column] = f"{(ours - theirs).abs().max() / ours.abs().max():.1e}"
     return row

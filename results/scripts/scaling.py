@@ -29,7 +29,7 @@ from page import SECONDS, Page, made_by, start
 
 from vibench import Reduction, Stop, create, provenance, solve_qp
 from vibench.linalg.factorisations import IMPLEMENTATIONS
-from vibench.report.figures.style import CaptionedFigure, set_ticks, styled
+from vibench.report.figures.style import Looks, Series, Sheet, plot, styled
 from vibench.timing import median_seconds, timed
 
 ACCURACY = 1e-10
@@ -45,7 +45,8 @@ UNTIMED = {"PGA": "offline", "reduction": "projection"}
 """Steps that are no part of a stage and have to be there before it."""
 
 OFFLINE = ("mesh and forms", *STEPS)
-ONLINE = ("query, full", "query, reduced", "QP solution")
+DRAWN = ("snapshots", "PGA", "query, full", "query, reduced")
+"""Curves of the picture."""
 
 
 @dataclass(frozen=True)
@@ -159,78 +160,62 @@ def slopes(points: pd.Series) -> list[float]:
     return list(np.diff(np.log(points.to_numpy())) / np.diff(np.log(points.index.to_numpy(float))))
 
 
-def draw(rows: pd.DataFrame, size: str) -> Figure:
-    """Seconds and memory over a size, logarithmic: a column for every problem."""
-    figure = CaptionedFigure(figsize=(10.0, 7.6), layout="constrained")
-    over = "the number n of unknowns" if size == "n" else "the number R of generators"
-    figure.caption = (
-        f"CPU seconds (top) and peak memory (bottom) of every stage over {over}, in logarithmic axes; a column for "
-        "every problem."
-    )
-    axes = figure.subplots(2, 2, sharex="col", squeeze=False)
-    for column, (name, group) in enumerate(rows.groupby("problem", sort=False)):
-        for k, stage in enumerate((*OFFLINE, *ONLINE)):
-            points = group[group["stage"] == stage].groupby(size)[["seconds", "memory_mib"]].median()
-            style = {"marker": "os^Dv<>phX"[k], "linestyle": ("-", "--", ":", "-.")[k % 4], "markersize": 4}
-            axes[0, column].loglog(points.index, points["seconds"], label=stage, **style)
-            if stage in OFFLINE:
-                axes[1, column].loglog(points.index, points["memory_mib"], label=stage, **style)
-        axes[0, column].set_title(name)
-        axes[1, column].set_xlabel("n, unknowns" if size == "n" else "R, generators")
-    for panel in axes.flat:
-        set_ticks(panel)
-    axes[0, 0].set_ylabel("seconds")
-    axes[1, 0].set_ylabel("peak memory [MiB]")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right center")
-    return figure
+def draw(rows: pd.DataFrame) -> Figure:
+    """Seconds over the number of unknowns, logarithmic: a panel for every problem."""
+    names = list(rows["problem"].unique())
+    sheet, looks = Sheet(1, len(names), "CPU seconds over the number of unknowns"), Looks(map(Series, DRAWN))
+    for panel, name in zip(sheet.panels, names, strict=True):
+        for stage in DRAWN:
+            mine = rows[(rows["problem"] == name) & (rows["stage"] == stage)].groupby("n")["seconds"].median()
+            plot(panel, mine.index, mine, looks[Series(stage)], stage)
+        panel.set(xscale="log", yscale="log", title=name, xlabel="unknowns", ylabel="seconds")
+    return sheet.finish("CPU seconds over the number of unknowns, of all snapshots and of single queries.")
 
 
 def main(target: str) -> None:
     rows = pd.DataFrame(all_rows())
     rows["n"] = rows["n"].fillna(rows.groupby(["over", "problem", "R"])["n"].ffill())
-    write_page(rows, target)
+    versions = ", ".join(f"{name} {text}" for name, text in provenance.versions("piqp").items())
+    write_page(rows.assign(machine=f"{provenance.machine()}; {versions}"), target)
 
 
 def write_page(rows: pd.DataFrame, target: str) -> None:
     """Figures and tables of the measurements."""
-    versions = ", ".join(f"{name} {text}" for name, text in provenance.versions("piqp").items())
     cases = "; ".join(f"{name}: N = {case.N}, R = {case.R}, δ_PGA = {case.delta:g}" for name, case in CASES.items())
     page = Page(
         target,
-        "Growth of seconds and memory",
+        "How do seconds and memory grow?",
         f"taskset -c 1 {made_by('scaling', 'scaling')}",
         SECONDS,
         "Exponents are the slopes in logarithmic axes from every size to the next one: the first ones show constant "
-        "costs, the last one the growth of large sizes. "
-        f"{cases}; mCPG; queries by PIQP at accuracy {ACCURACY:g}.",
-        machine=f"{provenance.machine()}; {versions}",
+        f"costs, the last one the growth of large sizes. {cases}; mCPG; queries by PIQP at accuracy {ACCURACY:g}.",
+        machine=rows["machine"].iloc[0],
     )
-    for over, size in (("mesh", "n"), ("R", "R")):
+    over_mesh = rows[rows["over"] == "mesh"]
+    grown = table(over_mesh[over_mesh["stage"].isin(DRAWN)], "seconds")[["problem", "stage", "exponents"]]
+    last = grown.set_index(["stage", "problem"])["exponents"].str.split(", ").str[-1].astype(float)
+    assert (last["query, reduced"].abs() < 0.5).all()
+    page.answer(
+        "A reduced query does not grow with the mesh. Towards the largest one, of "
+        f"{over_mesh['n'].max():,.0f} unknowns, exponents of snapshots are at most {last['snapshots'].max()}, of "
+        f"queries in full assembly {last['query, full'].max()}.",
+        grown,
+    )
+    with styled():
+        page.draw("over-n", draw(over_mesh))
+    for over, about in (("mesh", "over the mesh"), ("R", "over the number of generators, on the paper's mesh")):
         chosen = rows[rows["over"] == over]
-        page.section(f"Over {size}")
-        with styled():
-            page.draw(f"over-{size}", draw(chosen, size))
-        for name, group in chosen.groupby("problem", sort=False):
-            offline = group[group["stage"].isin(OFFLINE)]
-            page.section(f"{name}: seconds", table(group, "seconds"), level=3)
-            page.section(f"{name}: peak memory [MiB]", table(offline, "memory_mib"), level=3)
+        page.file(f"seconds-{over}", f"seconds of every stage {about}", table(chosen, "seconds"))
+        offline = chosen[chosen["stage"].isin(OFFLINE)]
+        page.file(f"memory-{over}", f"peak memory in MiB {about}", table(offline, "memory_mib"))
     compared = rows[(rows["over"] == "factorisation") & rows["stage"].isin(("snapshots", "PGA"))]
     if len(compared):
-        page.section("Factorisations")
-        for what, title in (("seconds", "seconds"), ("memory_mib", "peak memory [MiB]")):
-            by_name = [
-                table(group, what).assign(problem=name) for name, group in compared.groupby("factorisation", sort=False)
-            ]
-            page.section(
-                f"{FACTORISED[0]}: {title}", pd.concat(by_name).rename(columns={"problem": "factorisation"}), level=3
-            )
-    page.add(f"All measurements: {page.link('rows', rows)}.")
+        by_name = [table(group, "seconds").assign(factorisation=name)
+                   for name, group in compared.groupby("factorisation", sort=False)]  # fmt: skip
+        page.file("factorisations", f"seconds on {FACTORISED[0]} by the library that factorises", pd.concat(by_name))
+    page.file("rows", "all measurements", rows)
     page.write()
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--one"]:
-        for row in measure(*json.loads(sys.argv[2])):
-            print(json.dumps(row), flush=True)
-    else:
-        start(main)
+    start(main)

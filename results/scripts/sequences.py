@@ -18,22 +18,24 @@ def main(cold: str, warm: str, target: str) -> None:
     runs = [read(run, "queries") for run in (cold, warm)]
     cells = [read(run, "cells") for run in (cold, warm)]
     command = made_by("sequences", "sequences", *STUDIES, options=" --no-figures")
-    about = "Every program of a path is solved cold, and from the solution of the one before where the solver can."
-    page = Page(target, "Warm starts along paths", command, about, SECONDS, machine=origin(*cells))
-    table = compared(*(summary(run).join(timed(of)) for run, of in zip(runs, cells, strict=True)))
-    sizes = cells[0].drop_duplicates("problem").set_index("problem")
-    for problem, rows in table.groupby("problem", sort=False):
-        of = sizes.loc[problem]
-        added = f"{of['N']} modes, {of['enrichment']} vectors added, {of['R']} generators; {of['queries']} programs."
-        page.section(str(problem), added, rows.drop(columns="problem"))
-    page.section(
-        "How to read it",
-        "Seconds are those of the solver in the rounds, iterations medians over the programs of the path without the "
-        "first one. The ratio cold/warm is one of seconds in those of the high-fidelity solutions of the same rounds, "
-        "since the machine may be faster in one of the two runs. `start` says whether the solver can start from a "
-        "solution. Where it cannot, both runs solve the same programs cold, and the ratio is what two runs differ by.",
-        page.link("sequences", table),
+    about = (
+        "Every program of a path is solved cold, and from the solution of the one before where the solver can. Seconds "
+        "are those of the solver in the rounds, iterations medians without the first program. The ratio is one of "
+        "seconds in those of the high-fidelity solutions of the same rounds, since the machine may be faster in one of "
+        "the two runs. Where a solver cannot start, the ratio is what two runs differ by."
     )
+    page = Page(target, "Do warm starts pay along paths?", command, about, SECONDS, machine=origin(*cells))
+    table = compared(*(summary(run).join(timed(of)) for run, of in zip(runs, cells, strict=True)))
+    starts = table[table["start"] == "yes"].groupby("solver")["cold/warm"]
+    others = (table.loc[table["start"] == "no", "cold/warm"] - 1.0).abs().max()
+    page.answer(
+        "A start from the solution before divides the seconds by "
+        f"{', '.join(f'{ratio.median():.2g} (`{solver}`)' for solver, ratio in starts)}. Solvers that cannot start "
+        f"differ by at most {100 * others:.0f} % between the two runs.",
+        table.loc[table["start"] == "yes", ["problem", "solver", "cold [ms]", "warm [ms]", "cold/warm",
+                                            "iterations, cold", "iterations, warm"]],
+    )  # fmt: skip
+    page.file("sequences", "all solvers and problems", table)
     page.write()
 
 

@@ -1,4 +1,4 @@
-"""The page of a study under results/: comparison with the paper, summary, break-even, figures.
+"""The page of a study under results/: the question that it answers, a short table, a picture.
 
 vibench run paper-obstacle && python results/scripts/study.py runs/paper-obstacle results/paper-obstacle
 """
@@ -6,68 +6,177 @@ vibench run paper-obstacle && python results/scripts/study.py runs/paper-obstacl
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+import statistics
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
-from page import CERTIFIED, SECONDS, Page, alternative, escaped, made_by, origin, read, start, write_figure
+from page import CERTIFIED, SECONDS, Page, made_by, origin, read, span, start
 
 from vibench.report import figures
-from vibench.report.figures.style import caption_of, styled
+from vibench.report.figures.style import styled
 from vibench.results import formats
+from vibench.results.break_even import HIGH_FIDELITY, Meaning
 from vibench.results.ranking import relative_bounds
-from vibench.results.read import read_table, results_file
+from vibench.results.read import results_file
 from vibench_problems.paper.evidence import SOLVER, Evidence
+from vibench_problems.paper.published import HERTZ
 from vibench_problems.paper.tables import columns
 
-PAPER = ("paper-obstacle", "paper-hertz")
-"""Studies of the tables of the paper."""
-
-TABLES = ("cells", "thresholds", "disagreements")
+TABLES = {
+    "cells": "every cell, with all columns",
+    "thresholds": "break-even of all pairs of cells that differ in their enrichment, assembly or formulation alone",
+    "disagreements": "queries to which solvers give different answers",
+}
 """Tables written beside the page. Those of all queries and histories take megabytes and stay in the run folder."""
 
 FIGURES = {
-    "benefit": ("answer",),
-    "hertz-quadrature": ("answer",),
-    "solvers": ("solvers",),
-}
-"""Kinds of figures on the page of a study."""
+    "hertz-quadrature": ("exact-answer",), "solvers": ("obstacle-solvers",),
+    "paper-obstacle": ("obstacle-answer", "obstacle-convergence"),
+}  # fmt: skip
+"""The pictures of a page, if they are not the answer sheet of its first problem."""
 
-
-REPEATED = {"benefit": " --repeats 3"} | dict.fromkeys(PAPER, " --repeats 3")
+REPEATED = dict.fromkeys(("benefit", "paper-obstacle", "paper-hertz"), " --repeats 3")
 """Options of the runs whose seconds README and other pages quote: three cold processes, and offline phases."""
+
+Found = tuple[str, pd.DataFrame, str]
+"""The answer, a table, and how to read it."""
+
+
+def paper(run: str) -> Found:
+    """Dimensions and break-even beside those of the table of the paper."""
+    ((_, data),) = figures.problem_tables(results_file(run))
+    evidence = Evidence(data)
+    table = comparison(evidence)
+    published = table["break-even"]
+    pays = [float(one.removeprefix("from ")) for one in table["break-even, vibench"] if one != "never"]
+    when = f"pays from about {statistics.median(pays):.0f} queries on" if pays else "never pays"
+    sizes = table[["(N, R)", "(N, R), vibench"]].map(lambda text: [int(one) for one in text.strip("()").split(", ")])
+    apart = [abs(b / a - 1.0) for theirs, ours in sizes.to_numpy() for a, b in zip(theirs, ours, strict=True)]
+    prescribed = "N and R are prescribed as published"
+    same = f"N and R differ from the published ones by at most {100 * max(apart):.0f} %" if max(apart) else prescribed
+    return (
+        f"{same}. With full assembly, as in the "
+        f"paper, enriching offline {when} against online supremizers; there it pays from {published.min()} to "
+        f"{published.max()} queries on.",
+        table,
+        f"Table {evidence.paper.table} of Niakh, Drouet, Ehrlacher and Ern (2022), δ_PGA = {evidence.paper.tight:g}. "
+        f"Columns of vibench are by {SOLVER}, break-even is by the paper's formula, with its 95 % interval.",
+    )
+
+
+def benefit(run: str) -> Found:
+    """Gains over the next full solution by problem and assembly, and those of offline enrichment."""
+    every = read(run, "thresholds")
+    rows = []
+    for (problem, assembly), mine in every.groupby(["problem", "assembly_b"]):
+        full = mine[mine["primal_a"] == HIGH_FIDELITY]
+        pairs = mine[(mine["primal_a"] == "online-supremizers") & (mine["assembly_a"] == assembly)]
+        pairs = pairs[pairs["primal_b"] == "offline-pga"]
+        pays = full[full["meaning"] == Meaning.FROM]
+        rows.append({
+            "problem": problem, "assembly": assembly, "models": len(full), "gain": span(full["gain"]),
+            "pay from [queries]": span(pays["benefit_threshold"]), "undecided or never": len(full) - len(pays),
+            "gain of enriching offline": span(pairs["gain"]) if len(pairs) else "–",
+        })  # fmt: skip
+    table = pd.DataFrame(rows)
+    reduced = every[(every["primal_a"] == HIGH_FIDELITY) & (every["assembly_b"] == "reduced")].groupby("problem")
+    gains = " and ".join(f"{gain.median():.0f} on {problem}" for problem, gain in reduced["gain"])
+    return (
+        f"A query in reduced assembly is faster than the next full solution by a median factor of {gains}. With full "
+        "assembly most of that is lost, with C programs it grows.",
+        table,
+        "The gain divides the seconds of the next high-fidelity solution by the seconds of a query. The last column "
+        "compares a query after offline PGA with one that computes supremizers, in the same assembly.",
+    )
+
+
+def quadrature(run: str) -> Found:
+    """Dimensions of every variant of the contact quadrature and the master mesh."""
+    cells = read(run, "cells")
+    sizes = cells.set_index(["problem", "dual", "dual_tol"])
+    tight, loose = cells["dual_tol"].min(), cells["dual_tol"].max()
+    table = pd.DataFrame({
+        f"N, δ_POD = {tight:g}": sizes["N"].xs(("mcpg", tight), level=("dual", "dual_tol")),
+        **{f"R of {dual}, δ = {tol:g}": sizes["R"].xs((dual, tol), level=("dual", "dual_tol"))
+           for tol in (loose, tight) for dual in ("cpg", "mcpg")},
+    }).rename_axis("variant").reset_index()  # fmt: skip
+    modes, generators = table.iloc[:, 1], table[f"R of mcpg, δ = {loose:g}"]
+    exact = table["variant"].str.startswith("exact")
+    assert modes[exact].nunique() == generators[exact].nunique() == 1
+    return (
+        f"Much: N goes from {modes.min()} to {modes.max()}. R of mCPG goes from {generators.min()} to "
+        f"{generators.max()}. With exact integration both are the same on all meshes.",
+        table,
+        f"The paper has N = {HERTZ.modes[tight]} and, with mCPG, R = {HERTZ.generators[loose]}. `ratio` "
+        "is the fineness of the master surface.",
+    )
+
+
+def solvers(run: str) -> Found:
+    """Seconds of a program and failures of every solver at the highest accuracy."""
+    cells = read(run, "cells")
+    best = cells[cells["accuracy"] == cells["accuracy"].min()]
+    rows = []
+    for solver, mine in best.groupby("solver"):
+        row: dict[str, object] = {"solver": solver}
+        for problem, own in mine.groupby("problem"):
+            row[f"{problem} [ms]"] = 1e3 * own["online_solve_s"].median()
+            row[f"{problem}, ok"] = f"{own['queries_ok'].sum()} of {own['queries'].sum()}"
+        rows.append(row)
+    seconds = [f"{problem} [ms]" for problem in sorted(best["problem"].unique())]
+    table = pd.DataFrame(rows).sort_values(seconds[0])
+    whole = best.groupby("solver")[["queries", "queries_ok"]].sum()
+    reliable = sorted(whole.index[whole["queries"] == whole["queries_ok"]])
+    first, second = (table[table["solver"].isin(reliable)].iloc[k] for k in (0, 1))
+    factor = (second[seconds].astype(float) / first[seconds].astype(float)).mean()
+    assert (table[seconds].min() == first[seconds]).all()
+    return (
+        f"`{first['solver']}` is the fastest at the highest accuracy, on both problems. The next one that never fails, "
+        f"`{second['solver']}`, takes {factor:.1f} times its seconds. Every query is ok by {', '.join(reliable)}.",
+        table,
+        "Medians over the models of the seconds of a program, without assembly, and queries that are ok.",
+    )
+
+
+PAGES: dict[str, tuple[str, Callable[[str], Found]]] = {
+    "paper-obstacle": ("Does the obstacle problem of the paper come out as published?", paper),
+    "paper-hertz": ("Does Hertz contact come out as published?", paper),
+    "benefit": ("From how many queries do reduced models pay?", benefit),
+    "hertz-quadrature": ("Do dimensions of Hertz contact depend on the contact quadrature?", quadrature),
+    "solvers": ("Which QP solver?", solvers),
+}
+"""Question and answer of each study."""
 
 
 def main(run: str, target: str) -> None:
     path, name, cells = results_file(run), Path(target).name, read(run, "cells")
     shutil.rmtree(target, ignore_errors=True)
+    question, answer = PAGES[name]
     page = Page(
         target,
-        name,
+        question,
         made_by("study", name, name, options=REPEATED.get(name, "")),
         SECONDS,
-        f"`vibench run {name}` leaves the tables of all queries and histories under `runs/{name}/tables` and all "
-        f"figures under `runs/{name}/figures`.",
+        f"{len(cells)} cells, {int((cells['status'] == 'ok').sum())} with every query ok. `vibench run {name}` leaves "
+        f"the tables of all queries and histories under `runs/{name}/tables` and all figures under "
+        f"`runs/{name}/figures`.",
         machine=origin(cells),
     )
-    if name in PAPER:
-        ((_, data),) = figures.problem_tables(path)
-        evidence = Evidence(data)
-        page.section(
-            f"Comparison with Table {evidence.paper.table} of Niakh, Drouet, Ehrlacher and Ern (2022), δ_PGA = "
-            f"{evidence.paper.tight:g}",
-            comparison(evidence),
-            f"Columns of vibench: {SOLVER}, full assembly; break-even by the paper's formula, with its 95 % interval.",
-        )
-    page.section("All cells", *outcomes(cells), formats.summary(cells))
-    of_enrichments = read_table(path, "thresholds").dropna(subset="cell_a")
-    if len(of_enrichments):
-        page.section("Break-even of fixed enrichments", formats.break_even_table(of_enrichments))
-    page.section("Figures", *dict(sorted(drawn(path, page.folder))).values())
-    written = {table: frame for table in TABLES if len(frame := read(run, table))}
+    page.answer(*answer(run))
+    wanted = FIGURES.get(name, (f"{cells['problem'].iloc[0]}-answer",))
+    kinds = {one.rpartition("-")[2] for one in wanted}
+    with styled():
+        for drawing, draw, data in figures.drawings(figures.problem_tables(path), kinds):
+            if drawing in wanted and (figure := draw(data)) is not None:
+                page.draw(drawing, figure)
+    for table, about in TABLES.items():
+        if len(frame := read(run, table)):
+            page.file(table, about, frame)
     if (cells["assembly"] == CERTIFIED).any():
-        written["bounds"] = bounds(cells, read(run, "queries"))
-    page.add(f"Full tables: {', '.join(page.link(table, frame) for table, frame in written.items())}.")
+        page.file(
+            "bounds", "mean errors and bounds of certified models, and violations", bounds(cells, read(run, "queries"))
+        )
     page.write()
 
 
@@ -81,27 +190,6 @@ def bounds(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:
     of_cell = fine.groupby("cell")
     found["queries"], found["violations"] = of_cell.size(), of_cell["bound_online_violated"].sum()
     return found.reset_index()
-
-
-def outcomes(cells: pd.DataFrame) -> tuple[str, str]:
-    """How many cells there are, and a line for every solver and status of those that are not ok."""
-    lines = [
-        f"- {solver}: {len(group)} cells {status}, in which {int((group['queries'] - group['queries_ok']).sum())} of "
-        f"{int(group['queries'].sum())} queries are not ok"
-        for (solver, status), group in cells[cells["status"] != "ok"].groupby(["solver", "status"])
-    ]
-    fine = f"{len(cells)} cells, {int((cells['status'] == 'ok').sum())} with every query ok"
-    return f"{fine}{'; the others:' if lines else '.'}", "\n".join(lines)
-
-
-def drawn(path: Path, folder: Path) -> Iterator[tuple[str, str]]:
-    """Draw the figures of the page; returns the name of each, and the picture with its caption."""
-    kinds = FIGURES.get(folder.name, ("answer", "convergence"))
-    with styled():
-        for name, draw, data in figures.drawings(figures.problem_tables(path), kinds):
-            if (figure := draw(data)) is not None:
-                file = write_figure(figure, folder, name)
-                yield name, f"![{alternative(figure, name)}]({file.name})\n\n{escaped(caption_of(figure))}"
 
 
 def comparison(evidence: Evidence) -> pd.DataFrame:

@@ -1,5 +1,6 @@
 import html
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -9,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import RendererAgg
 from matplotlib.contour import ContourSet
@@ -22,6 +25,7 @@ from vibench.report import figures, save, styled
 from vibench.report.figures import KINDS, answer_sheet, draw_all, effectivity, spaces
 from vibench.report.figures import problem_tables as of_file
 from vibench.report.figures.data import ProblemTables, _per_combination
+from vibench.report.figures.style import set_ticks
 from vibench.report.html import page as report_page
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
@@ -216,6 +220,20 @@ def test_a_logarithmic_panel_with_nothing_to_show_stays_empty(change: Change, dr
     for axes in (sigma, beta):
         low, high = axes.get_ylim()
         assert 0.0 < low < high
+
+
+@given(st.floats(-9.0, 8.0), st.floats(0.05, 6.0))
+def test_labels_of_logarithmic_axes_say_where_they_stand(first: float, decades: float) -> None:
+    axes = Figure().add_subplot()
+    axes.set(xscale="log", xlim=(10.0**first, 10.0 ** (first + decades)))
+    set_ticks(axes)
+    axes.figure.draw_without_rendering()
+    plain = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+    for tick in axes.get_xticklabels():
+        text = tick.get_text()
+        power = re.fullmatch(r"(?:(.+)·)?10([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)", text)
+        value = f"{power[1] or 1}e{power[2].translate(plain)}" if power else text.replace(",", "")
+        assert float(value) == pytest.approx(tick.get_position()[0], rel=5e-3)
 
 
 def test_cells_that_failed_stop_no_others(change: Change, draw: Draw, results: Path, tmp_path: Path) -> None:

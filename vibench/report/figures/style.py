@@ -319,7 +319,14 @@ def set_ticks(axes: Axes) -> None:
         elif few:
             # Numbers such as 0.00005 at 2 and 5 of every decade would touch where there are more than about five.
             axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0) if decades < 1.4 else (1.0, 3.0)))
-        axis.set_major_formatter("{x:.3g}" if few else _power)
+        axis.set_major_formatter(_plain if few else _power)
+
+
+def _plain(value: float, _: float) -> str:
+    digits, exponent = (*f"{value:.3g}".split("e"), "0")[:2]
+    if 0 <= int(exponent) < 6:
+        return f"{float(digits) * 10 ** int(exponent):,.10g}"
+    return f"{digits}·".removeprefix("1·") + _power(float(f"1e{exponent}"), 0.0)
 
 
 def _power(value: float, _: float) -> str:
