@@ -123,9 +123,8 @@ def share_of_diagonal(X: InnerProduct) -> Constant:
     diagonal = X.matrix.diagonal()
     # A rough estimate is enough: it is moved by the largest margin.
     xi = _lowest(X.matrix, InnerProduct(sp.diags_array(diagonal)), X.riesz)(1e-2) / (1.0 + MARGINS[-1])
-    if implementation(X.factorisation).is_iterative:  # a factor is what its choice avoids
-        return Constant(xi, False)
-    return Constant(xi, proved_positive([X.matrix, sp.diags_array(-xi * diagonal)], np.sqrt(diagonal)) == X.dim)
+    parts = [X.matrix, sp.diags_array(-xi * diagonal)]
+    return Constant(xi, is_proved_definite(parts, implementation(X.factorisation)))
 
 
 def continuity(quotients: Quotients) -> Constant:
