@@ -126,16 +126,16 @@ def main(run: str, target: str) -> None:
     verdicts = {"obstacle": judged(obstacle), "hertz": judged(hertz)}
     changed = {name: int((table["on all meshes"] == "no").sum()) for name, table in verdicts.items()}
     count, tied = sum(map(len, verdicts.values())), pd.DataFrame([ties(mesh) for mesh in [*obstacle, *hertz]])
-    most = tied.loc[tied["ties"].idxmax()]
+    most, sizes = tied.loc[tied["ties"].idxmax()], dimensions([*obstacle, *hertz])
     page.answer(
         f"Of {count} conclusions {' and '.join(f'{some} on {name}' for name, some in changed.items())} are not the "
         f"same on all meshes. On {most['mesh']} {most['ties']} of the {most['steps of CPG']} steps of CPG are ties, "
         "which the smallest index decides.",
-        dimensions([*obstacle, *hertz]).query("dual == 'mcpg'").drop(columns="dual"),
+        sizes.query("dual == 'mcpg'").drop(columns="dual"),
     )
     for name, table in verdicts.items():
         page.file(f"conclusions-{name}", "every conclusion on every mesh, and its figure", table)
-    page.file("dimensions", "dimensions, constants and errors of both cones", dimensions([*obstacle, *hertz]))
+    page.file("dimensions", "dimensions, constants and errors of both cones", sizes)
     page.file(
         "ties",
         f"steps of CPG (δ = {TIGHT:g}) at which another snapshot is as far from the cone as the farthest one, to "
