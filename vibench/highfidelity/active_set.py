@@ -186,7 +186,7 @@ class HighFidelitySolver:
         few = len(vi.g) <= min(1000, FEW_PER_UNKNOWN * len(vi.f))
         if self._condensing or "A" in self._problem.constant or pattern.is_dense or not few:
             return pattern
-        return EliminationPattern.of_none(vi.A, factorisation)
+        return EliminationPattern.of_none(vi.A)
 
 
 def solve_high_fidelity(

@@ -18,13 +18,13 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.optimize import nnls
 from scipy.sparse.csgraph import reverse_cuthill_mckee, structural_rank
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix, times_dense
 from vibench.interfaces.dual_sets import RAYS, DualSet
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg import EPS
-from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
+from vibench.linalg.cholesky import OrderedFactor, SparseCholesky
 from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal, Factor
 from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.linalg.inner_product import check_regular
@@ -92,7 +92,7 @@ class CondensedStiffness(Inverse):
     """A stiffness matrix A (n×n), sparse SPD, condensed on the unknowns that constraints involve.
 
     The pattern retains at least all unknowns that B touches; by default every unknown is retained. The `factorisation`
-    eliminates the others; the sparse systems of active sets are SuperLU's.
+    eliminates the others, and factorises systems of active sets that have an order.
     """
 
     def __init__(
@@ -238,7 +238,8 @@ class CondensedStiffness(Inverse):
             solve_active = ComplianceSolver(self._blocks, self._last[1], B, vi.g)
         else:
             # A larger border takes longer than another factorisation.
-            solve_active = SaddlePointSolver(self._A if whole else condensed.schur, load, B, vi.g, 16, whole)
+            stiffness = self._A if whole else condensed.schur
+            solve_active = SaddlePointSolver(stiffness, load, B, vi.g, 16, whole, self._factorisation)
             self._saddle = solve_active if whole else None
         recover = partial(condensed.recover, particular=particular)
         return ActiveSetSystem(B, vi.g, solve_active, recover, condensed.correct_eliminated, K=vi.K)
@@ -399,9 +400,10 @@ class SaddlePointSolver:
     """
 
     def __init__(
-        self, A: SparseMatrix, f: Array, B: SparseMatrix, g: Array, border: int, order: PrincipalSubmatrix | None = None
-    ) -> None:
-        self._border = border
+        self, A: SparseMatrix, f: Array, B: SparseMatrix, g: Array, border: int,
+        order: PrincipalSubmatrix | None = None, factorisation: str = DEFAULT,
+    ) -> None:  # fmt: skip
+        self._border, self._library = border, factorisation
         A, B, self._order = sp.csr_array(A), sp.csr_array(B), slice(None) if order is None else order.chosen
         if order is not None:
             A, f = order.of(A), f[self._order]
@@ -436,7 +438,7 @@ class SaddlePointSolver:
             # Keep this order: the set must stay that of the last factorisation where this one fails.
             zero = sp.csr_array((len(active), len(active)))  # blocks that are all CSR are stacked without triplets
             saddle = sp.block_array([[self._A, sp.csr_array(B.T)], [B, zero]], format="csr").T
-            self._factorisation = _BorderedFactorisation(saddle, len(active) if self._ordered else None)
+            self._factorisation = _BorderedFactorisation(saddle, len(active) if self._ordered else None, self._library)
             self._factorised_set, self._is_factorised = active, is_active
             solution = self._solve_bordered(self._factorisation, active, is_active)
         assert solution is not None  # an empty border is always independent
@@ -445,18 +447,14 @@ class SaddlePointSolver:
     @property
     def is_definite(self) -> bool:
         """Whether a factorisation has shown that A is positive definite, and the rows of its active set independent."""
-        return self._factorisation is not None and self._factorisation.pivots is not None
+        return self._factorisation is not None and self._factorisation.ordered is not None
 
     def dual_norms(self, functionals: Array) -> Array:
-        """Norms (k,) in A⁻¹ of functionals (c×k), from a factorisation that `is_definite`.
-
-        The system with ℓ and zero on the right has the solution x, y: ℓ = A x + B_aᵀy, B_a x = 0, both parts orthogonal
-        in A⁻¹, and the second one has the norm of y in B_a A⁻¹B_aᵀ.
-        """
+        """Norms (k,) in A⁻¹ of functionals (c×k), from a factorisation that `is_definite`."""
         assert self._factorisation is not None  # as `is_definite` says
+        assert self._factorisation.ordered is not None
         functionals = self._displacement[:, None] * functionals[self._order]
-        x, forces = self._factorisation.split(functionals)
-        return np.asarray(np.sqrt(np.maximum(np.einsum("ik,ik->k", x, functionals), 0.0) + forces))
+        return np.asarray(np.sqrt(np.maximum(self._factorisation.ordered.squares(functionals), 0.0)))
 
     def _solve_bordered(
         self, factorisation: _BorderedFactorisation, active: Indices, is_active: Mask
@@ -492,34 +490,22 @@ class _BorderedFactorisation:
     """The LU factorisation of a symmetric system K (k×k), solved with borders of a few rows and columns.
 
     Raises a `RuntimeError` if it is exactly singular, or has no solution. A system that is singular up to round-off may
-    still be consistent; its solution is verified by the active set method. `pivots` are those of a saddle point system
-    whose `last` unknowns are multipliers, in natural order, where all have their signs beyond round-off.
+    still be consistent; its solution is verified by the active set method. `ordered` is the factor of a saddle point
+    system whose `last` unknowns are multipliers, if all its pivots have their signs beyond round-off.
     """
 
-    def __init__(self, matrix: SparseMatrix, last: int | None = None) -> None:
+    def __init__(self, matrix: SparseMatrix, last: int | None = None, factorisation: str = DEFAULT) -> None:
         self._matrix = matrix
-        self.pivots: Array | None = None
+        self.ordered: OrderedFactor | None = None
         self._unbordered: Array | None = None
         self._columns = dict[int, Array]()
         if last is not None:
-            self._factor = symmetric_lu(matrix, "NATURAL")
-            pivots, size = np.asarray(self._factor.U.diagonal()), matrix.shape[0] - last
+            factor, size = implementation(factorisation).in_order(matrix), matrix.shape[0] - last
             # Rows have length 1 and A the diagonal 1: smaller pivots may consist of round-off alone.
-            regular = np.all(pivots[:size] > 16.0 * EPS * size) and np.all(pivots[size:] < -1e-12)
-            natural = np.array_equal(self._factor.perm_r, np.arange(len(pivots)))
-            self.pivots = pivots if regular and natural else None
-        if self.pivots is None:
-            self._factor = splu(matrix)
-
-    def split(self, functionals: Array) -> tuple[Array, Array]:
-        """The x (n×k) of the solution with ℓ (n×k) and zero on the right, and yᵀ(B_a A⁻¹B_aᵀ)y (k,)."""
-        assert self.pivots is not None  # of an ordered system
-        n = len(functionals)
-        right = np.zeros((self._matrix.shape[0], functionals.shape[1]))
-        right[:n] = functionals
-        solved = self._factor.solve(right)
-        corner = self._factor.L[:, n:].T @ solved
-        return solved[:n], np.asarray(-self.pivots[n:] @ corner**2)
+            if (pivots := factor.pivots) is not None:
+                regular = np.all(pivots[:size] > 16.0 * EPS * size) and np.all(pivots[size:] < -1e-12)
+                self.ordered = factor if regular else None
+        self._factor: OrderedFactor | SuperLU = self.ordered or splu(matrix)
 
     def solve(
         self, names: list[int], border: Array, right: Array, values: Array, is_new: bool
@@ -546,7 +532,7 @@ class _BorderedFactorisation:
         x, y = bordered(first, values)
         rest = right - self._matrix @ x - border @ y
         # The constraints contradict each other, or round-off alone made their system regular.
-        if self.pivots is None and not peak(rest) <= 1e-3 * peak(right):
+        if self.ordered is None and not peak(rest) <= 1e-3 * peak(right):
             raise RuntimeError("the system has no solution")
         dx, dy = bordered(self._factor.solve(rest), values - border.T @ x)
         return x + dx, y + dy

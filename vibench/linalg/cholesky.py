@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from math import sqrt
@@ -29,6 +30,44 @@ def symmetric_lu(matrix: SparseMatrix, order: str) -> SuperLU:
     # Above 32 nonzeros per row, as in elasticity in space, SuperLU is fastest with panels of 20 columns, below with 1.
     panel = 20 if matrix.nnz > 32 * matrix.shape[0] else 1
     return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, panel_size=panel, options={"SymmetricMode": True})
+
+
+class OrderedFactor(ABC):
+    """Factors L D Lᵀ of a sparse symmetric matrix (k×k), also an indefinite one, in its natural order.
+
+    `pivots` are the diagonal of D, `None` where this order has none.
+    """
+
+    pivots: Array | None
+
+    @abstractmethod
+    def solve(self, right: Array) -> Array:
+        """The solution for right-hand sides (k,) or (k, j), if there are pivots."""
+
+    @abstractmethod
+    def squares(self, functionals: Array) -> Array:
+        """Values ℓᵀA⁻¹ℓ (j,) of functionals (n, j), A being the first n rows and columns, if there are pivots."""
+
+
+class OrderedLU(OrderedFactor):
+    """Factors by SuperLU; raises a `RuntimeError` if the matrix (CSC) is exactly singular."""
+
+    def __init__(self, matrix: SparseMatrix) -> None:
+        self._lu = symmetric_lu(matrix, "NATURAL")
+        natural = np.array_equal(self._lu.perm_r, np.arange(matrix.shape[0]))
+        self.pivots = np.asarray(self._lu.U.diagonal()) if natural else None
+
+    def solve(self, right: Array) -> Array:
+        return np.asarray(self._lu.solve(right))
+
+    def squares(self, functionals: Array) -> Array:
+        # The solution x, y for ℓ and zero splits ℓ = A x + Bᵀy, B x = 0, into parts that are orthogonal in A⁻¹. The
+        # second one has the norm of y in B A⁻¹Bᵀ.
+        assert self.pivots is not None
+        n = len(functionals)
+        solved = self._lu.solve(np.pad(functionals, ((0, len(self.pivots) - n), (0, 0))))
+        corner = self._lu.L[:, n:].T @ solved
+        return np.asarray(np.einsum("ik,ik->k", solved[:n], functionals) - self.pivots[n:] @ corner**2)
 
 
 def few_at_once(solve: Callable[[Array], Array], right: Array) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from functools import cached_property
 from importlib import import_module
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError, RequestError, UnsupportedError, foreign, unknown_name
-from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
+from vibench.linalg.cholesky import OrderedFactor, OrderedLU, PartialCholesky, SparseCholesky, elimination_order
 from vibench.linalg.definite import BlockDiagonal, Elimination, Factor, FactoredElimination, checked
 from vibench.linalg.multigrid import MultigridFactor
 from vibench.provenance import distribution_version
@@ -74,6 +74,13 @@ class Implementation(ABC):
         """Eliminate all unknowns of a `matrix` (n×n) but `last` (c,), by the default where this one shows no factor."""
         return IMPLEMENTATIONS[DEFAULT].eliminate_with_factor(matrix, last, name)
 
+    def in_order(self, matrix: SparseMatrix) -> OrderedFactor:
+        """Factorise a symmetric `matrix` (k×k, CSC) in its natural order; not every one has pivots.
+
+        Raises a `RuntimeError` if it is exactly singular.
+        """
+        return OrderedLU(matrix)
+
     def order(self, matrix: SparseMatrix, last: Indices) -> Indices:
         """Return an order (n,) for `eliminate` that ends with the unknowns `last` (c,)."""
         # Libraries order the others themselves.
@@ -121,39 +128,80 @@ class _Pardiso(Implementation):
 
 
 class _Cholmod(Implementation):
-    name, summary, distribution = "cholmod", "CHOLMOD, supernodal", "cvxopt"
+    name, summary, distribution = "cholmod", "CHOLMOD", "cvxopt"
     module = "cvxopt.cholmod"
 
     def _factor(self, matrix: SparseMatrix, name: str) -> Factor:
         return CholmodFactor(matrix, name)
 
+    def in_order(self, matrix: SparseMatrix) -> OrderedFactor:
+        return OrderedCholmod(matrix)
 
-class CholmodFactor(Factor):
-    """A supernodal Cholesky factor by CHOLMOD of SuiteSparse."""
 
-    def __init__(self, matrix: SparseMatrix, name: str) -> None:
+class _CholmodSolver:
+    """Factors of a sparse symmetric matrix (n×n) by CHOLMOD of SuiteSparse, in an `order` (n,) or one of its own.
+
+    Raises an `ArithmeticError` if a pivot vanishes, or is negative in a supernodal factor.
+    """
+
+    def __init__(self, matrix: SparseMatrix, order: Indices | None = None, **options: int) -> None:
         from cvxopt import base, cholmod  # noqa: PLC0415  an optional library
 
-        lower, self._library, self._dense = sp.coo_array(sp.tril(matrix)), cholmod, base.matrix
-        rows, columns = lower.coords
-        sparse: Any = base.spmatrix
-        values: Any = [self._dense(part) for part in (lower.data.astype(float), rows.astype(int), columns.astype(int))]
-        entries = sparse(*values, matrix.shape)
-        self._symbolic = cholmod.symbolic(entries)
+        matrix, self._library, self._dense = sp.csc_array(matrix), cholmod, base.matrix
+        rows, columns = matrix.indices, np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+        lower, sparse = rows >= columns, cast("Any", base.spmatrix)
+        parts = (matrix.data.astype(float), rows.astype(int), columns)
+        entries = sparse(*(self._dense(cast("Any", part[lower])) for part in parts), matrix.shape)
+        before, given = dict(cholmod.options), () if order is None else (self._dense(cast("Any", order)),)
+        # Options of this library are global.
+        cholmod.options.update(options)
         try:
+            self._symbolic = cholmod.symbolic(entries, *given)
             cholmod.numeric(entries, self._symbolic)
-            # Only the diagonal raises where the factorisation has stopped before its end.
-            cholmod.diag(self._symbolic)
-        except (ArithmeticError, ValueError):
-            raise NumericalError(f"{name} is not positive definite") from None
+        finally:
+            cholmod.options.clear()
+            cholmod.options.update(before)
 
-    def solve(self, right: Array) -> Array:
+    def solve(self, right: Array, system: int = 0) -> Array:
+        """Solve with all factors, or one `system`: 4 is L, 6 is D."""
         if not right.size:
             return np.zeros_like(right, dtype=float)
         columns: Any = np.asfortranarray(right.reshape(len(right), -1), dtype=float)
         solution = self._dense(columns)
-        self._library.solve(self._symbolic, solution)
+        self._library.solve(self._symbolic, solution, system)
         return np.ascontiguousarray(np.array(solution).reshape(columns.shape)).reshape(right.shape)
+
+
+class CholmodFactor(_CholmodSolver, Factor):
+    """A supernodal Cholesky factor by CHOLMOD."""
+
+    def __init__(self, matrix: SparseMatrix, name: str) -> None:
+        try:
+            super().__init__(matrix)
+            # Only the diagonal raises where the factorisation has stopped before its end.
+            self._library.diag(self._symbolic)
+        except (ArithmeticError, ValueError):
+            raise NumericalError(f"{name} is not positive definite") from None
+
+
+class OrderedCholmod(_CholmodSolver, OrderedFactor):
+    """Factors by CHOLMOD, column by column, which may have negative pivots; there are none where one vanishes."""
+
+    def __init__(self, matrix: SparseMatrix) -> None:
+        order = np.arange(matrix.shape[0])
+        try:
+            # Neither compare the order with others nor change it.
+            super().__init__(matrix, order, supernodal=0, nmethods=1, postorder=False)
+        except ArithmeticError:
+            self.pivots = None
+        else:
+            self.pivots = 1.0 / self.solve(np.ones(len(order)), 6)
+
+    def squares(self, functionals: Array) -> Array:
+        assert self.pivots is not None
+        n = len(functionals)
+        solved = self.solve(np.pad(functionals, ((0, len(self.pivots) - n), (0, 0))), 4)[:n]
+        return np.asarray((1.0 / self.pivots[:n]) @ solved**2)
 
 
 class _Multigrid(Implementation):

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
-from vibench.linalg.cholesky import PartialCholesky
+from vibench.linalg.cholesky import PartialCholesky, elimination_order
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.factorisations import DEFAULT, implementation
 
@@ -73,10 +73,10 @@ class EliminationPattern:
         return cls(retained, inside[order], interface)
 
     @classmethod
-    def of_none(cls, A: SparseMatrix, factorisation: str = DEFAULT) -> EliminationPattern:
+    def of_none(cls, A: SparseMatrix) -> EliminationPattern:
         """The pattern that eliminates no unknown of matrices with the sparsity of A (n×n), and orders all."""
         none = np.zeros(0, np.intp)
-        return cls(np.arange(A.shape[0]), none, none, PrincipalSubmatrix(implementation(factorisation).order(A, none)))
+        return cls(np.arange(A.shape[0]), none, none, PrincipalSubmatrix(elimination_order(A, none)))
 
 
 class PrincipalSubmatrix:

@@ -15,7 +15,7 @@ from vibench.errors import NumericalError
 from vibench.highfidelity import active_set, kkt_systems
 from vibench.highfidelity.kkt_systems import CondensedStiffness, MultigridStiffness
 from vibench.interfaces.problem import VariationalInequality
-from vibench.linalg.factorisations import DEFAULT, IMPLEMENTATIONS
+from vibench.linalg.factorisations import IMPLEMENTATIONS
 from vibench.linalg.multigrid import NullSpaceSolver
 from vibench.linalg.schur_complement import EliminationPattern
 from vibench.qp import kkt_residuals
@@ -125,7 +125,7 @@ def test_systems_that_cannot_be_regular_are_not_factorised(
 ) -> None:
     """SuperLU took minutes for such systems, or destroyed the heap."""
     vi = replace(string(36, 0.0, -1.0), B=sp.csr_array(sp.vstack([sp.csr_array(part) for part in rows])))
-    stiffness = made(vi.A, EliminationPattern.of_none(vi.A, DEFAULT) if whole else None)
+    stiffness = made(vi.A, EliminationPattern.of_none(vi.A) if whole else None)
     vi, factorised, plain = replace(vi, g=np.full(vi.B.shape[0], bound)), [], kkt_systems.splu
     monkeypatch.setattr(kkt_systems, "splu", lambda matrix: factorised.append(matrix.shape[0]) or plain(matrix))
     if reason:
