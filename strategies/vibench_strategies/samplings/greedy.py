@@ -29,7 +29,7 @@ class Greedy(AdaptiveSampling):
         candidates: Annotated[int, Ge(2), Le(1_000_000)],
         tolerance: Annotated[float, Gt(0.0), Lt(1.0)],
         seed: Annotated[int, Ge(0), Lt(2**63)] = 0,
-        drawn: Annotated[int, Ge(1)] = 4,
+        drawn: Annotated[int, Ge(1)] = 2,
         checked: Annotated[int, Ge(1)] = 100,
         most: Annotated[int, Ge(1)] = 1000,
     ) -> None:
