@@ -9,7 +9,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from vibench import AdaptiveSampling, Array, ParameterBox, Trainer
 from vibench_strategies.samplings.candidates import AMONG, Candidates
 
-WEAK = 0.8
+WEAK = 0.5
 """The worst bound is at least this share of all known ones, most of which are those of earlier models."""
 
 
@@ -29,7 +29,7 @@ class Greedy(AdaptiveSampling):
         candidates: Annotated[int, Ge(2), Le(1_000_000)],
         tolerance: Annotated[float, Gt(0.0), Lt(1.0)],
         seed: Annotated[int, Ge(0), Lt(2**63)] = 0,
-        drawn: Annotated[int, Ge(1)] = 2,
+        drawn: Annotated[int, Ge(1)] = 3,
         checked: Annotated[int, Ge(1)] = 100,
         most: Annotated[int, Ge(1)] = 1000,
     ) -> None:
