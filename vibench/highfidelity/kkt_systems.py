@@ -487,7 +487,7 @@ def _in_units(rows: Array, matrix: SparseMatrix, columns: Array) -> SparseMatrix
 
 
 class _BorderedFactorisation:
-    """The LU factorisation of a symmetric system K (k×k), solved with borders of a few rows and columns.
+    """A factorisation of a symmetric system K (k×k), solved with borders of a few rows and columns.
 
     Raises a `RuntimeError` if it is exactly singular, or has no solution. A system that is singular up to round-off may
     still be consistent; its solution is verified by the active set method. `ordered` is the factor of a saddle point
