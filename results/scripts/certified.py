@@ -210,8 +210,8 @@ def main(certified: str, training: str, target: str) -> None:
     )
     page.also(
         "[unseen.csv](unseen.csv)",
-        "effectivities, violations and corrections at random parameters, by "
-        "`python tests/benchmarks/certified.py runs/certified --table results/certified/unseen.csv`",
+        "effectivities, violations and corrections at random parameters, as many as its column `parameters` says, by "
+        "`python tests/benchmarks/certified.py runs/certified COUNT PROBLEM --table FILE`",
     )
     failed = pd.concat(frame[frame["status"] != "ok"] for frame in (cells, trained))
     page.file("not-ok", "cells that are not ok, and why", failed[["cell", *MODEL, "status", "reason"]])
