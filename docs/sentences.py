@@ -426,9 +426,8 @@ def space() -> Sequence[str]:
     pays = pairs[pairs["in place of"] == ONLINE].groupby("assembly")["pays, in queries"].value_counts()
     assert pays["reduced"].to_dict() == {"at once": len(meshes) * 4}
     assert set(pays["certified"].index) <= {"undecided", "as fast", "at once"}
-    counts = ", ".join(
-        f"{count} are {meaning.replace('at', 'cheaper at')}" for meaning, count in pays["certified"].items()
-    )
+    certified = pays["certified"].rename({"at once": "cheaper at once"})
+    counts = ", ".join(f"{count} are {meaning}" for meaning, count in certified.items())
     return [
         f"of {pays['certified'].sum()} pairs of certified ones {counts}",
         table_rows([name, *(one.get(name, "–") for one in columns)] for name in columns[0]),

@@ -502,9 +502,8 @@ class _BorderedFactorisation:
         if last is not None:
             factor, size = implementation(factorisation).in_order(matrix), matrix.shape[0] - last
             # Rows have length 1 and A the diagonal 1: smaller pivots may consist of round-off alone.
-            if (pivots := factor.pivots) is not None:
-                regular = np.all(pivots[:size] > 16.0 * EPS * size) and np.all(pivots[size:] < -1e-12)
-                self.ordered = factor if regular else None
+            if np.all(factor.pivots[:size] > 16.0 * EPS * size) and np.all(factor.pivots[size:] < -1e-12):
+                self.ordered = factor
         self._factor: OrderedFactor | SuperLU = self.ordered or splu(matrix)
 
     def solve(

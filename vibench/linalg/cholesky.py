@@ -35,18 +35,18 @@ def symmetric_lu(matrix: SparseMatrix, order: str) -> SuperLU:
 class OrderedFactor(ABC):
     """Factors L D Lᵀ of a sparse symmetric matrix (k×k), also an indefinite one, in its natural order.
 
-    `pivots` are the diagonal of D, `None` where this order has none.
+    `pivots` (k,) are the diagonal of D. They are NaN where this order has none, and nothing can be solved then.
     """
 
-    pivots: Array | None
+    pivots: Array
 
     @abstractmethod
     def solve(self, right: Array) -> Array:
-        """The solution for right-hand sides (k,) or (k, j), if there are pivots."""
+        """The solution for right-hand sides (k,) or (k, j)."""
 
     @abstractmethod
     def squares(self, functionals: Array) -> Array:
-        """Values ℓᵀA⁻¹ℓ (j,) of functionals (n, j), A being the first n rows and columns, if there are pivots."""
+        """Values ℓᵀA⁻¹ℓ (j,) of functionals (n, j), A being the first n rows and columns."""
 
 
 class OrderedLU(OrderedFactor):
@@ -55,7 +55,7 @@ class OrderedLU(OrderedFactor):
     def __init__(self, matrix: SparseMatrix) -> None:
         self._lu = symmetric_lu(matrix, "NATURAL")
         natural = np.array_equal(self._lu.perm_r, np.arange(matrix.shape[0]))
-        self.pivots = np.asarray(self._lu.U.diagonal()) if natural else None
+        self.pivots = np.asarray(self._lu.U.diagonal()) if natural else np.full(matrix.shape[0], np.nan)
 
     def solve(self, right: Array) -> Array:
         return np.asarray(self._lu.solve(right))
@@ -63,7 +63,6 @@ class OrderedLU(OrderedFactor):
     def squares(self, functionals: Array) -> Array:
         # The solution x, y for ℓ and zero splits ℓ = A x + Bᵀy, B x = 0, into parts that are orthogonal in A⁻¹. The
         # second one has the norm of y in B A⁻¹Bᵀ.
-        assert self.pivots is not None
         n = len(functionals)
         solved = self._lu.solve(np.pad(functionals, ((0, len(self.pivots) - n), (0, 0))))
         corner = self._lu.L[:, n:].T @ solved

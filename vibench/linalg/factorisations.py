@@ -185,7 +185,7 @@ class CholmodFactor(_CholmodSolver, Factor):
 
 
 class OrderedCholmod(_CholmodSolver, OrderedFactor):
-    """Factors by CHOLMOD, column by column, which may have negative pivots; there are none where one vanishes."""
+    """Factors by CHOLMOD, column by column, which may have negative pivots; all are NaN where one vanishes."""
 
     def __init__(self, matrix: SparseMatrix) -> None:
         order = np.arange(matrix.shape[0])
@@ -193,12 +193,11 @@ class OrderedCholmod(_CholmodSolver, OrderedFactor):
             # Neither compare the order with others nor change it.
             super().__init__(matrix, order, supernodal=0, nmethods=1, postorder=False)
         except ArithmeticError:
-            self.pivots = None
+            self.pivots = np.full(len(order), np.nan)
         else:
             self.pivots = 1.0 / self.solve(np.ones(len(order)), 6)
 
     def squares(self, functionals: Array) -> Array:
-        assert self.pivots is not None
         n = len(functionals)
         solved = self.solve(np.pad(functionals, ((0, len(self.pivots) - n), (0, 0))), 4)[:n]
         return np.asarray((1.0 / self.pivots[:n]) @ solved**2)
